@@ -93,11 +93,8 @@ def slabs_of(search, frequency, permittivity=4.0, conductivity=0.02, thickness=0
 @jax.jit
 def arrivals_of(search: ImageTree, traced: TracedPaths, slabs: Slabs, receiver: Receiver, frequency, antennas=()) -> Paths:
     """What arrives over all paths, those without diffraction first, between the antennas of transmitter and elements."""
-    found = [
-        arrivals(some, search, slabs, frequency, receiver, MECHANISMS[some.mechanism].transport, *antennas)
-        for some in traced.sets
-    ]
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
+    transports = tuple(MECHANISMS[some.mechanism].transport for some in traced.sets)
+    return arrivals(traced, search, slabs, frequency, receiver, transports, *antennas)
 
 
 def snapshot_of(search, tx, frequency, receiver=None, antennas=(), **slab) -> np.ndarray:

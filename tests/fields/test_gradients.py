@@ -20,7 +20,7 @@ from wbgs_jax.data.scene import surface_from_points
 from wbgs_jax.fields import coherent, get_field, wideband
 from wbgs_jax.fields.nerf2 import Nerf2Config, Nerf2Field
 from wbgs_jax.propagation.materials import Slabs
-from wbgs_jax.propagation.paths import PathGeometry
+from wbgs_jax.propagation.paths import PathGeometry, TracedPaths
 from wbgs_jax.propagation.transport import arrivals, specular_transport
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
 from wbgs_jax.splat import TileLimits
@@ -244,9 +244,10 @@ def test_what_is_no_path_has_no_gradient_and_spoils_none(x64):
     @jax.jit
     @partial(jax.grad, argnums=(0, 1))
     def gradients(points, orientation):
-        paths = PathGeometry(points, nothing, nothing, nothing, jnp.array([True, False]))
+        paths = TracedPaths((PathGeometry(points, nothing, nothing, nothing, jnp.array([True, False])),))
         receiver = dataclasses.replace(plan.receiver, orientation=orientation)
-        return arrivals(paths, plan.surfaces, slabs, jnp.asarray(3e9), receiver, specular_transport).amplitude.real.sum()
+        found = arrivals(paths, plan.surfaces, slabs, jnp.asarray(3e9), receiver, (specular_transport,))
+        return found.amplitude.real.sum()
 
     for gradient in map(np.asarray, gradients(jnp.asarray(points), plan.receiver.orientation)):
         assert np.isfinite(gradient).all() and gradient.any()

@@ -27,7 +27,7 @@ from wbgs_jax.propagation.absorption import Grid, attenuation, smoothed
 from wbgs_jax.propagation.displacement import Motion, length_changes, path_coherence
 from wbgs_jax.propagation.image_method import ImageTree, Surfaces
 from wbgs_jax.propagation.materials import Slabs, complex_permittivity
-from wbgs_jax.propagation.mechanisms import MECHANISMS, concatenated, sizes_of, trace_paths
+from wbgs_jax.propagation.mechanisms import MECHANISMS, sizes_of, trace_paths
 from wbgs_jax.propagation.moving_tree import tree_at
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED, PathGeometry, TracedPaths
 from wbgs_jax.propagation.transport import arrivals, covariance_from_paths, snapshots_from_paths
@@ -288,22 +288,20 @@ def transmitter_antenna(params: WaveParams, transmitter: Transmitter) -> Antenna
 def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, link: Query) -> Paths:
     """Returns the arrivals over all paths of one link."""
     frequency_hz = link.frequency_hz
-    slabs, found = slabs_at(params, plan, frequency_hz), []
-    density = None if params.clutter is None else _density_at(params.clutter, frequency_hz)
     antennas = transmitter_antenna(params, link.transmitter), params.element
-    for some in paths.sets:
-        transport = MECHANISMS[some.mechanism].transport
-        one = arrivals(some, plan.surfaces, slabs, frequency_hz, plan.receiver, transport, *antennas)
-        gain = jnp.exp(params.log_gain) * _corrections(params, some)
-        if density is not None:
-            assert plan.grid is not None, "a field with absorption parameters has a grid"
-            gain = gain * jnp.exp(-attenuation(one.points, density, plan.grid))
-        if plan.motion is not None:
-            cycles = frequency_hz / SPEED_OF_LIGHT * length_changes(some, plan.surfaces, plan.motion)
-            gain = gain * phasor(-cycles)
-        assert one.polarised is not None, "arrivals of traced paths have it"
-        found.append(one._replace(amplitude=one.amplitude * gain, polarised=one.polarised * gain[:, None]))
-    return concatenated(found)._replace(spherical_wave=params.curved)
+    transports = tuple(MECHANISMS[some.mechanism].transport for some in paths.sets)
+    slabs = slabs_at(params, plan, frequency_hz)
+    found = arrivals(paths, plan.surfaces, slabs, frequency_hz, plan.receiver, transports, *antennas)
+    gain = jnp.exp(params.log_gain) * _corrections(params, paths)
+    if params.clutter is not None:
+        assert plan.grid is not None, "a field with absorption parameters has a grid"
+        gain = gain * jnp.exp(-attenuation(found.points, _density_at(params.clutter, frequency_hz), plan.grid))
+    if plan.motion is not None:
+        cycles = frequency_hz / SPEED_OF_LIGHT * length_changes(paths.together, plan.surfaces, plan.motion)
+        gain = gain * phasor(-cycles)
+    assert found.polarised is not None, "arrivals of traced paths have it"
+    amplitudes = {"amplitude": found.amplitude * gain, "polarised": found.polarised * gain[:, None]}
+    return found._replace(**amplitudes, spherical_wave=params.curved)
 
 
 def transparent_grid(shape: tuple[int, int, int]) -> Float[Array, "x y z 2"]:
@@ -330,16 +328,21 @@ def _density_at(stored_density: Float[Array, "x y z 2"], frequency_hz: Float[Arr
     return (1 - share) * at_low + share * at_high
 
 
-def _corrections(params: WaveParams, paths: PathGeometry) -> Complex[Array, " k"]:
-    """Returns the factors of K paths of one mechanism due to facet corrections and additional losses."""
-    kind = paths.interaction_type
-    row = min(list(MECHANISMS).index(paths.mechanism), len(params.excess_loss) - 1)
-    counts = jnp.stack([jnp.sum(kind == one, -1) for one in (TRANSMITTED, REFLECTED, DIFFRACTED)], -1)
-    reflects = kind == REFLECTED
-    correction = params.facet_correction[jnp.where(reflects, paths.interaction_facet, 0)]
+def _corrections(params: WaveParams, paths: TracedPaths) -> Complex[Array, " k"]:
+    """Returns the factors of K paths due to facet corrections and additional losses."""
+    reflects = paths.together.interaction_type == REFLECTED
+    correction = params.facet_correction[jnp.where(reflects, paths.together.interaction_facet, 0)]
     total = jnp.where(reflects[..., None], correction, 0).sum(-2)
-    losses = jnp.matmul(counts.astype(total.dtype), params.excess_loss[row], precision=EXACT)
+    losses = jnp.concatenate([_losses(params, some) for some in paths.sets])
     return jnp.exp(total[:, 0] - losses + 1j * total[:, 1])
+
+
+def _losses(params: WaveParams, paths: PathGeometry) -> Float[Array, " k"]:
+    """Returns the additional losses of K paths of one mechanism, nepers."""
+    row = min(list(MECHANISMS).index(paths.mechanism), len(params.excess_loss) - 1)
+    counts = [jnp.sum(paths.interaction_type == kind, -1) for kind in (TRANSMITTED, REFLECTED, DIFFRACTED)]
+    losses = params.excess_loss[row]
+    return jnp.matmul(jnp.stack(counts, -1).astype(losses.dtype), losses, precision=EXACT)
 
 
 def prepare_paths(links: Links, plan_of: Callable[[int], WavePlan]) -> PreparedPaths:

@@ -121,8 +121,8 @@ def coherence(gradient: Float[Array, "k m 3"], spread: Float[Array, " m"], waven
 def path_coherence(
     paths: TracedPaths, surfaces: Surfaces, spread: Float[Array, " places"], wavenumber: Float[Array, ""]
 ) -> Float[Array, "k k"]:
-    """Returns the `coherence` of all paths of one transmitter, mechanism by mechanism, at a cost that does not grow with the
-    number of rigid bodies: only a path's own mirrors and edges are visited.
+    """Returns the `coherence` of all paths of one transmitter, at a cost that does not grow with the number of rigid bodies:
+    only a path's own mirrors and edges are visited.
 
     Args:
         paths: of one transmitter.
@@ -130,11 +130,8 @@ def path_coherence(
         spread: standard deviation of the position of every rigid body and, last, of the transmitter along each axis, metres.
         wavenumber: radians per metre.
     """
-    bends = [_bends(some, surfaces, MECHANISMS[some.mechanism].vertices) for some in paths.sets]
-    variance = (wavenumber * spread) ** 2
-    upper = {(i, j): _phase_covariance(bends[i], bends[j], variance) for i in range(len(bends)) for j in range(i, len(bends))}
-    rows = [[upper[i, j] if i <= j else upper[j, i].T for j in range(len(bends))] for i in range(len(bends))]
-    both = jnp.block(rows)
+    most = max(MECHANISMS[some.mechanism].vertices for some in paths.sets)
+    both = _phase_covariance(_bends(paths.together, surfaces, most), (wavenumber * spread) ** 2)
     own = jnp.diagonal(both)
     found = jnp.exp(-0.5 * jnp.maximum(own[:, None] + own - 2 * both, 0))
     if all(MECHANISMS[some.mechanism].coherent for some in paths.sets):
@@ -162,13 +159,13 @@ def _bends(paths: PathGeometry, surfaces: Surfaces, most: int) -> _Bends:
     return _Bends(*found, -segments_of(paths).direction[:, 0])
 
 
-def _phase_covariance(first: _Bends, second: _Bends, variance: Float[Array, " places"]) -> Float[Array, "k l"]:
-    """Returns the covariance of the phases of K paths with those of L others. The sums over vertices and components are written
-    out, so that no array larger than K L is ever stored."""
-    total = _dot_products(variance[-1] * first.departing, second.departing)
-    for turn, rigid_body in zip(first.turn, first.rigid_body, strict=True):
+def _phase_covariance(bends: _Bends, variance: Float[Array, " places"]) -> Float[Array, "k k"]:
+    """Returns the covariance of the phases of K paths. The sums over vertices and components are written out, so that no array
+    larger than K K is ever stored."""
+    total = _dot_products(variance[-1] * bends.departing, bends.departing)
+    for turn, rigid_body in zip(bends.turn, bends.rigid_body, strict=True):
         weighted = turn * variance[rigid_body][:, None]
-        for other, its in zip(second.turn, second.rigid_body, strict=True):
+        for other, its in zip(bends.turn, bends.rigid_body, strict=True):
             total += jnp.where(rigid_body[:, None] == its, _dot_products(weighted, other), 0)
     return total
 

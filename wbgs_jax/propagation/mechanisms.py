@@ -7,7 +7,6 @@ A further mechanism is an entry here, with its two functions in a module of its 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 from jaxtyping import Array, Float
 
 from wbgs_jax.propagation.image_method import ImageTree
@@ -61,8 +60,3 @@ def trace_paths(tree: ImageTree, tx_position: Float[Array, "3"], sizes: Sizes) -
             strongest of these, by mechanism; fewer paths if fewer are tried.
     """
     return TracedPaths(tuple(MECHANISMS[name].trace(tx_position, tree, tried, kept) for name, tried, kept in sizes))
-
-
-def concatenated(parts: list[Any]) -> Any:
-    """Returns trees of arrays of several mechanisms as one, in the order of their paths."""
-    return jax.tree.map(lambda *leaves: jax.numpy.concatenate(leaves), *parts)

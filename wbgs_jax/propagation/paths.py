@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from wbgs_jax._util.bits import WORD, in_chunks, members, packed
-from wbgs_jax._util.pytree import AnyArray, pytree, static
+from wbgs_jax._util.pytree import AnyArray, pytree, static, with_leaves
 from wbgs_jax.mesh.edges import Edges, about_edges
 from wbgs_jax.mesh.facets import CORNERS, Facets, HalfPlanes
 from wbgs_jax.propagation.image_method import GROUP, ImageTree, ReflectionSequences
@@ -117,6 +117,12 @@ class TracedPaths:
     def diffracted(self) -> PathGeometry:
         """Paths with one diffraction each."""
         return self.of("diffracted")
+
+    @property
+    def together(self) -> PathGeometry:
+        """Paths of all mechanisms, in order, as one set; of one transmitter, without batch axes."""
+        leaves = (jnp.concatenate(parts) for parts in zip(*map(jax.tree.leaves, self.sets), strict=True))
+        return with_leaves(self.sets[0], *leaves)
 
     @property
     def alive(self) -> Bool[Array, "*b k"]:

@@ -18,12 +18,12 @@ from wbgs_jax._util.complex_math import phasor
 from wbgs_jax.mesh.edges import Edges
 from wbgs_jax.propagation.image_method import Surfaces
 from wbgs_jax.propagation.materials import Slabs, slab_coefficients
-from wbgs_jax.propagation.paths import MAX_INTERACTIONS, NONE, REFLECTED, PathGeometry, is_vertex, on_edge
+from wbgs_jax.propagation.paths import MAX_INTERACTIONS, NONE, REFLECTED, PathGeometry, TracedPaths, is_vertex, on_edge
 from wbgs_jax.propagation.utd import wedge_coefficients
 from wbgs_jax.radio.antenna import Antenna, upright, zenith_vector
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, steering_vector
 from wbgs_jax.radio.channel import Paths
-from wbgs_jax.radio.geometry import to_local
+from wbgs_jax.radio.geometry import rotation_matrix
 from wbgs_jax.types import Receiver
 
 SHORTEST = 1e-9
@@ -76,50 +76,58 @@ Transport = Callable[[Complex[Array, "k 3"], Passage], tuple[Complex[Array, "k 3
 (k,), per metre."""
 
 
-@partial(jax.jit, static_argnames="transport")
+@partial(jax.jit, static_argnames="transports")
 def arrivals(
-    paths: PathGeometry,
+    paths: TracedPaths,
     surfaces: Surfaces,
     slabs: Slabs,
     frequency_hz: Float[Array, ""],
     receiver: Receiver,
-    transport: Transport,
+    transports: tuple[Transport, ...],
     transmitter: Antenna | None = None,
     element: Antenna | None = None,
 ) -> Paths:
-    """Returns the amplitudes that a transmitter of unit power produces over K paths.
+    """Returns the amplitudes that a transmitter of unit power produces over K paths, in the order of their mechanisms.
 
     Args:
-        paths: of one transmitter and one mechanism (`mechanisms.trace_paths`).
+        paths: of one transmitter (`mechanisms.trace_paths`).
         surfaces: surfaces in which the paths were found; paths refer to their facets and edges by index.
         slabs: materials of the facets at this frequency.
         frequency_hz: of the carrier.
         receiver: the receiver at the end of the paths.
-        transport: that of the mechanism of the paths (`mechanisms.Mechanism`); static under `jax.jit`.
+        transports: transport of the mechanism of each set of paths (`mechanisms.Mechanism`); static under `jax.jit`.
         transmitter: its antenna in the world frame; by default vertically polarised and isotropic.
         element: an antenna factor of every array element in addition to its given pattern, in the receiver's frame; by default
             vertically polarised and isotropic, which changes nothing.
     """
     isotropic = upright(jnp.zeros_like(receiver.pattern_exponents))
     transmitter, element = transmitter or isotropic, element or isotropic
+    # Everything but the transport is computed for all mechanisms together: a program of half the size.
+    whole = paths.together
     # Padded paths may have segments of zero length, whose directions have no derivative.
-    somewhere = jnp.asarray(SOMEWHERE, paths.points.dtype)
-    paths = dataclasses.replace(paths, points=jnp.where(paths.alive[:, None, None], paths.points, somewhere))
-    segments = segments_of(paths)
-    field = transmitter.field(segments.direction[:, 0]).astype(slabs.permittivity.dtype)
-    interactions = _slab_interactions(paths, segments, surfaces, slabs, frequency_hz)
-    field, spreading = transport(field, Passage(paths, segments, interactions, surfaces, slabs, frequency_hz))
-    last = last_segment(paths)
+    somewhere = jnp.asarray(SOMEWHERE, whole.points.dtype)
+    whole = dataclasses.replace(whole, points=jnp.where(whole.alive[:, None, None], whole.points, somewhere))
+    segments = segments_of(whole)
+    sent = transmitter.field(segments.direction[:, 0]).astype(slabs.permittivity.dtype)
+    known = sent, whole.points, segments, _slab_interactions(whole, segments, surfaces, slabs, frequency_hz)
+    arrived, first = [], 0
+    for some, transport in zip(paths.sets, transports, strict=True):
+        rows = slice(first, first := first + len(some.alive))
+        own, points, legs, met = jax.tree.map(lambda leaf, rows=rows: leaf[rows], known)
+        passage = Passage(dataclasses.replace(some, points=points), legs, met, surfaces, slabs, frequency_hz)
+        arrived.append(transport(own, passage))
+    field, spreading = map(jnp.concatenate, zip(*arrived, strict=True))
+    last = last_segment(whole)
     arrival = segments.direction[jnp.arange(len(last)), last]
-    local, here = to_local(-arrival, receiver.orientation), to_local(field, receiver.orientation)
-    theta, wavelength = zenith_vector(local), SPEED_OF_LIGHT / frequency_hz
-    own = _element_field(receiver.antenna, element, local)
+    rotation, wavelength = rotation_matrix(receiver.orientation), SPEED_OF_LIGHT / frequency_hz
+    local, here = (jnp.matmul(world, rotation, precision=EXACT) for world in (-arrival, field))
+    own, theta = _element_field(receiver.antenna, element, local), zenith_vector(local)
     parts = jnp.stack([_dot(here, basis) for basis in (own, theta, jnp.cross(local, theta))], -1)
     scale = wavelength / (4 * jnp.pi) * spreading * phasor(-segments.total / wavelength)
-    amplitudes = jnp.where(paths.alive[:, None], scale[:, None] * parts, 0)
-    met = paths.interaction_type, _materials(paths, surfaces)
-    arrived = amplitudes[:, 0], local, segments.total, segments.direction[:, 0], arrival, amplitudes[:, 1:]
-    return Paths(*arrived, *met, points=paths.points)
+    amplitudes = jnp.where(whole.alive[:, None], scale[:, None] * parts, 0)
+    numbers = whole.interaction_type, _materials(whole, surfaces)
+    values = amplitudes[:, 0], local, segments.total, segments.direction[:, 0], arrival, amplitudes[:, 1:]
+    return Paths(*values, *numbers, points=whole.points)
 
 
 def _element_field(antenna: Antenna, further: Antenna, direction: Float[Array, "k 3"]) -> Inexact[Array, "k 3"]:

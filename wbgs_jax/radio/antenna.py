@@ -105,9 +105,9 @@ class Antenna:
     @jax.jit
     def field(self, direction: Float[Array, "*m 3"]) -> Inexact[Array, "*m 3"]:
         """Returns the polarised amplitude gain of one antenna in unit directions: a vector across each direction."""
-        own = direction if self.orientation is None else to_local(direction, self.orientation)
-        gain = _parametric_gain(own, self.exponents)
         rotation = None if self.orientation is None else rotation_matrix(self.orientation)
+        own = direction if rotation is None else jnp.matmul(direction, rotation, precision=EXACT)
+        gain = _parametric_gain(own, self.exponents)
         field = zenith_vector(own) if self.pattern is None else self.pattern.at(own)
         if self.slant is not None:
             field = jnp.cos(self.slant) * field + jnp.sin(self.slant) * jnp.cross(own, field)
