@@ -171,9 +171,15 @@ def test_a_validation_fraction_outside_0_and_1(dataset, fraction):
         hold_out_validation(dataset, fraction)
 
 
-def test_a_single_training_transmitter_stays(dataset):
-    few = fewer_transmitters(dataset, 1, 0)
-    assert len(hold_out_validation(few).validation) == 0 and len(hold_out_validation(few).train) == len(few.train)
+@pytest.mark.parametrize(
+    ("count", "fraction", "moved"),
+    [(1, 0.1, 0), (1, 0.5, 0), (2, 0.1, 0), (3, 0.1, 0), (3, 0.3, 0), (4, 0.1, 1), (2, 0.5, 1), (3, 0.7, 2)],
+)
+def test_of_few_training_transmitters_all_stay_unless_more_are_wanted(count, fraction, moved):
+    few = fewer_transmitters(tiny_dataset(8), count, 0)
+    held = hold_out_validation(few, fraction)
+    assert len(np.unique(held.tx_index[held.validation])) == moved
+    assert len(held.train) + len(held.validation) == len(few.train)
 
 
 def test_validation_keeps_the_training_frequencies(dataset):

@@ -14,7 +14,16 @@ from wbgs_jax.fields import get_field
 from wbgs_jax.fields import mixture as noise
 from wbgs_jax.fields.base import outputs_of, paths_of
 from wbgs_jax.fields.hybrid import HybridField, Trust, _informed
-from wbgs_jax.fields.mixture import FEATURES, ExpertPredictions, Shares, constant, reported, with_floor, without_floor
+from wbgs_jax.fields.mixture import (
+    FEATURES,
+    ExpertPredictions,
+    Shares,
+    coherent_alone,
+    constant,
+    reported,
+    with_floor,
+    without_floor,
+)
 from wbgs_jax.inference.predictor import observe_links
 from wbgs_jax.inference.trained_field import RunConfig
 from wbgs_jax.radio.array import snapshot_to_pas
@@ -104,6 +113,13 @@ def test_the_shares_are_what_explains_other_links_best(run, share):
     assert np.abs(said - power).mean() < 0.1 * np.abs(wave.power_db - informed.power_db).mean()
     assert sum(report["shares"]["spectra"][name] for name in ("coherent", "own", "informed")) == pytest.approx(1, abs=2e-3)
     assert report["shares"]["spectra"]["by_query"] is False
+
+
+def test_without_other_links_the_coherent_field_is_used_alone(run):
+    found, report = weighted(run, run.state.params, [])
+    expected = Trust(coherent_alone(), coherent_alone(), jnp.zeros(()))
+    jax.tree.map(np.testing.assert_array_equal, found.trust, expected)
+    assert not report
 
 
 @pytest.mark.heavy

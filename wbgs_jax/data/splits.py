@@ -16,6 +16,8 @@ from wbgs_jax.data.dataset import Dataset
 
 VALIDATION = 0.1
 """Fraction of the training transmitters used for validation, unless the data specify a validation part."""
+FEWEST = 4
+"""Minimum number of training transmitters of which some are held out for validation."""
 
 
 def group_transmitters(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
@@ -50,21 +52,25 @@ def tx_disjoint_split(
 
 def hold_out_validation(dataset: Dataset, fraction: float = VALIDATION) -> Dataset:
     """Returns the dataset with `fraction` of its training transmitters moved to the validation part. If these are fewer than
-    eight, eight are moved, but at most a quarter of all, since fewer would decide nothing.
+    eight, eight are moved, but at most a quarter of all, since fewer would decide nothing. Of fewer than `FEWEST` none is moved
+    unless `fraction` is at least one of them: calibration needs them all, and a single one decides nothing.
 
-    The choice depends only on the split, not on a run's seed or on what is trained. Data with a validation part of their own,
-    and data with a single training transmitter, are unchanged.
+    The choice depends only on the split, not on a run's seed or on what is trained. Data with a validation part of their own
+    are unchanged.
 
     Raises:
         UserError: the fraction is not between 0 and 1.
     """
     tx_index = dataset.tx_index[dataset.train]
-    if len(dataset.validation) or len(np.unique(tx_index)) < 2:
-        return dataset
     transmitters = np.unique(tx_index)
+    if len(dataset.validation) or len(transmitters) < 2:
+        return dataset
     few, largest_share = 8, 0.25  # desired minimum number of validation transmitters, and maximum fraction used to reach it
     if 0 < fraction < 1:  # other values are rejected below
-        fraction = max(fraction, min(few / len(transmitters), largest_share))
+        if len(transmitters) >= FEWEST:
+            fraction = max(fraction, min(few / len(transmitters), largest_share))
+        elif fraction * len(transmitters) < 1:
+            return dataset
     seed = zlib.crc32(transmitters.astype("<i8").tobytes())
     moved = _draw(tx_index, fraction, np.random.default_rng(seed), "validation")
     return dataclasses.replace(dataset, train=dataset.train[~moved], validation=dataset.train[moved])

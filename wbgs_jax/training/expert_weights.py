@@ -40,8 +40,8 @@ class Seen(NamedTuple):
 @dataclass(frozen=True)
 class ExpertWeights(Hook):
     """The hook of a `Mixing` field: fits the mixture weights to validation links, which none of its components was trained on.
-    For spectra or powers without observations the coherent field is used alone. The noise floor of spectra is estimated as well
-    (`fields.mixture`)."""
+    For spectra or powers without observations, and without validation links, the coherent field is used alone. The noise floor
+    of spectra is estimated as well (`fields.mixture`)."""
 
     stream: int = 4
 
@@ -52,12 +52,13 @@ class ExpertWeights(Hook):
     def apply(
         self, field: Field, params: Params, statistics: tuple[()], context: Context, step: int, rng: np.random.Generator
     ) -> Edit:
-        """Returns the parameters with fitted weights, or unchanged if a component or the validation links are missing."""
+        """Returns the parameters with fitted weights, or unchanged if a component is missing."""
         mixing, same = field.ability(Mixing), Edit(params, (), lambda tree: tree, {})
         if mixing is None or len(components_of(field)) < len(field.components):
             return same
         if not (batches := context.validation()):
-            return same
+            alone = mixing.field.with_shares(mixing.of(params), coherent_alone(), coherent_alone())
+            return same._replace(params=mixing.put(params, alone))
         context.say("validation: weights of the coherent and the splatting half")
         raw = mixing.put(params, mixing.field.with_shares(mixing.of(params)))
         receivers = {_receiver_of(batch): batch.receiver for batch in batches}
