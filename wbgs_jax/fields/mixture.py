@@ -360,8 +360,8 @@ def floor_of(predicted: ExpertPredictions, observed: Float[np.ndarray, "n 90 360
 def observed_predictions(predicted: ExpertPredictions, floor: float) -> ExpertPredictions:
     """Returns spectra of the experts as they would be observed if the floor were first removed from those that have learned it
     and then added to all (host)."""
-    own, informed = (np.asarray(at_least_floor(learned, floor)) for learned in predicted[1:])
-    coherent = np.where(_met(predicted)[:, None, None], np.asarray(with_floor(predicted.coherent, floor)), own)
+    own, informed = (np.asarray(at_least_floor(jnp.asarray(learned), floor)) for learned in predicted[1:])
+    coherent = np.where(_met(predicted)[:, None, None], np.asarray(with_floor(jnp.asarray(predicted.coherent), floor)), own)
     return ExpertPredictions(coherent, own, informed)
 
 
