@@ -226,7 +226,7 @@ def spectra_of(
     if plan.lag_basis is not None:
         return covariance_to_pas(covariance, plan.lag_basis)
     elements = plan.receiver.element_wavelengths(frequency_hz)
-    return wide_covariance_to_pas(covariance, jnp.broadcast_to(elements, (len(covariance), *elements.shape[-2:])))
+    return wide_covariance_to_pas(covariance, jnp.broadcast_to(elements, (covariance.shape[0], *elements.shape[-2:])))
 
 
 @jax.jit
