@@ -11,7 +11,7 @@ from wbgs_jax.mesh.edges import Edges, edges_of_facets
 from wbgs_jax.mesh.facets import Facets, facets_from_mesh
 from wbgs_jax.propagation.image_method import ImageTree, make_image_tree
 from wbgs_jax.propagation.materials import Slabs, complex_permittivity
-from wbgs_jax.propagation.mechanisms import MECHANISMS, trace_paths
+from wbgs_jax.propagation.mechanisms import trace_paths, transports_of
 from wbgs_jax.propagation.paths import TracedPaths
 from wbgs_jax.propagation.transport import arrivals, snapshots_from_paths
 from wbgs_jax.radio.channel import Paths
@@ -93,8 +93,7 @@ def slabs_of(search, frequency, permittivity=4.0, conductivity=0.02, thickness=0
 @jax.jit
 def arrivals_of(search: ImageTree, traced: TracedPaths, slabs: Slabs, receiver: Receiver, frequency, antennas=()) -> Paths:
     """What arrives over all paths, those without diffraction first, between the antennas of transmitter and elements."""
-    transports = tuple(MECHANISMS[some.mechanism].transport for some in traced.sets)
-    return arrivals(traced, search, slabs, frequency, receiver, transports, *antennas)
+    return arrivals(traced, search, slabs, frequency, receiver, transports_of(traced), *antennas)
 
 
 def snapshot_of(search, tx, frequency, receiver=None, antennas=(), **slab) -> np.ndarray:

@@ -60,10 +60,11 @@ def test_a_stride_leaves_out_windows(images, stride):
         assert abs(expected - windows.mean()) > 1e-9
 
 
-def test_ssim_of_mixtures_is_that_of_each_mixture(images, rng):
+@pytest.mark.parametrize("stride", [1, losses.COARSE])
+def test_ssim_of_mixtures_is_that_of_each_mixture(images, rng, stride):
     truth, shares = jnp.asarray(rng.random(images[0].shape)), np.array([0.0, 0.3, 1.0])
-    found = jax.jit(losses.ssim_of_mixtures)(*images, truth, jnp.asarray(shares))
-    expected = [ssim(share * images[0] + (1 - share) * images[1], truth) for share in shares]
+    found = jax.jit(losses.ssim_of_mixtures, static_argnames="stride")(*images, truth, jnp.asarray(shares), stride=stride)
+    expected = [ssim(share * images[0] + (1 - share) * images[1], truth, stride) for share in shares]
     np.testing.assert_allclose(found.T, expected, rtol=1e-9)
 
 

@@ -27,7 +27,7 @@ from wbgs_jax.propagation.absorption import Grid, attenuation, smoothed
 from wbgs_jax.propagation.displacement import Motion, length_changes, path_coherence
 from wbgs_jax.propagation.image_method import ImageTree, Surfaces
 from wbgs_jax.propagation.materials import Slabs, complex_permittivity
-from wbgs_jax.propagation.mechanisms import MECHANISMS, sizes_of, trace_paths
+from wbgs_jax.propagation.mechanisms import MECHANISMS, sizes_of, trace_paths, transports_of
 from wbgs_jax.propagation.moving_tree import tree_at
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED, PathGeometry, TracedPaths
 from wbgs_jax.propagation.transport import arrivals, covariance_from_paths, snapshots_from_paths
@@ -289,9 +289,8 @@ def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, link: Qu
     """Returns the arrivals over all paths of one link."""
     frequency_hz = link.frequency_hz
     antennas = transmitter_antenna(params, link.transmitter), params.element
-    transports = tuple(MECHANISMS[some.mechanism].transport for some in paths.sets)
     slabs = slabs_at(params, plan, frequency_hz)
-    found = arrivals(paths, plan.surfaces, slabs, frequency_hz, plan.receiver, transports, *antennas)
+    found = arrivals(paths, plan.surfaces, slabs, frequency_hz, plan.receiver, transports_of(paths), *antennas)
     gain = jnp.exp(params.log_gain) * _corrections(params, paths)
     if params.clutter is not None:
         assert plan.grid is not None, "a field with absorption parameters has a grid"
@@ -330,8 +329,9 @@ def _density_at(stored_density: Float[Array, "x y z 2"], frequency_hz: Float[Arr
 
 def _corrections(params: WaveParams, paths: TracedPaths) -> Complex[Array, " k"]:
     """Returns the factors of K paths due to facet corrections and additional losses."""
-    reflects = paths.together.interaction_type == REFLECTED
-    correction = params.facet_correction[jnp.where(reflects, paths.together.interaction_facet, 0)]
+    whole = paths.together
+    reflects = whole.interaction_type == REFLECTED
+    correction = params.facet_correction[jnp.where(reflects, whole.interaction_facet, 0)]
     total = jnp.where(reflects[..., None], correction, 0).sum(-2)
     losses = jnp.concatenate([_losses(params, some) for some in paths.sets])
     return jnp.exp(total[:, 0] - losses + 1j * total[:, 1])

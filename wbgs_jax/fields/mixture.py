@@ -192,9 +192,9 @@ def learn_shares(
     return Shares(coherent, learn_share(Scored(features, worth(first, predicted.informed), tx_index)))
 
 
-def similarity(truth: Float[np.ndarray, "n 90 360"], one: Any, other: Any) -> Float[np.ndarray, "n shares"]:
-    """Returns the SSIM of the mixtures of two spectra with all weights of `SHARES`."""
-    return in_blocks(_ssim_of_mixtures, one, other, truth)
+def similarity(truth: Float[np.ndarray, "n 90 360"], one: Any, other: Any, stride: int = 1) -> Float[np.ndarray, "n shares"]:
+    """Returns the SSIM, at every `stride`-th window, of the mixtures of two spectra with all weights of `SHARES`."""
+    return in_blocks(partial(_ssim_of_mixtures, stride=stride), one, other, truth)
 
 
 def in_blocks(score: Callable[..., Array], *spectra: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n tried"]:
@@ -205,9 +205,9 @@ def in_blocks(score: Callable[..., Array], *spectra: Float[np.ndarray, "n 90 360
     return np.concatenate([np.asarray(score(*(each[block] for each in spectra))) for block in blocks])
 
 
-@jax.jit
-def _ssim_of_mixtures(one: Any, other: Any, truth: Float[Array, "b 90 360"]) -> Float[Array, "b shares"]:
-    return ssim_of_mixtures(jnp.asarray(one), jnp.asarray(other), truth, jnp.asarray(SHARES, jnp.float32), COARSE)
+@partial(jax.jit, static_argnames="stride")
+def _ssim_of_mixtures(one: Any, other: Any, truth: Float[Array, "b 90 360"], stride: int) -> Float[Array, "b shares"]:
+    return ssim_of_mixtures(jnp.asarray(one), jnp.asarray(other), truth, jnp.asarray(SHARES, jnp.float32), stride)
 
 
 def nearness(measured_db: Float[np.ndarray, " n"], one: Any, other: Any) -> Float[np.ndarray, "n shares"]:
@@ -239,7 +239,7 @@ def _best(scores: Float[np.ndarray, "n shares"]) -> float:
 
 
 def _worth(share: Share, known: Scored) -> Float[np.ndarray, " n"]:
-    return np.asarray(_score_of(share, known.features.astype(np.float32), known.scores.astype(np.float32)))
+    return np.asarray(_score_of(share, known.features, known.scores))
 
 
 @jax.jit
@@ -360,9 +360,9 @@ def floor_of(predicted: ExpertPredictions, observed: Float[np.ndarray, "n 90 360
 def observed_predictions(predicted: ExpertPredictions, floor: float) -> ExpertPredictions:
     """Returns spectra of the experts as they would be observed if the floor were first removed from those that have learned it
     and then added to all (host)."""
-    own, informed = (np.asarray(at_least_floor(jnp.asarray(learned), floor)) for learned in predicted[1:])
-    coherent = np.where(_met(predicted)[:, None, None], np.asarray(with_floor(jnp.asarray(predicted.coherent), floor)), own)
-    return ExpertPredictions(coherent, own, informed)
+    own, informed = (at_least_floor(jnp.asarray(learned), floor) for learned in predicted[1:])
+    coherent = jnp.where(_met(predicted)[:, None, None], with_floor(jnp.asarray(predicted.coherent), floor), own)
+    return ExpertPredictions(*(np.asarray(spectra) for spectra in (coherent, own, informed)))
 
 
 def _met(predicted: ExpertPredictions) -> Bool[np.ndarray, " n"]:

@@ -60,3 +60,8 @@ def trace_paths(tree: ImageTree, tx_position: Float[Array, "3"], sizes: Sizes) -
             strongest of these, by mechanism; fewer paths if fewer are tried.
     """
     return TracedPaths(tuple(MECHANISMS[name].trace(tx_position, tree, tried, kept) for name, tried, kept in sizes))
+
+
+def transports_of(paths: TracedPaths) -> tuple[Transport, ...]:
+    """Returns the transport of the mechanism of each set of paths, for `transport.arrivals`."""
+    return tuple(MECHANISMS[some.mechanism].transport for some in paths.sets)

@@ -23,7 +23,7 @@ from wbgs_jax.propagation.utd import wedge_coefficients
 from wbgs_jax.radio.antenna import Antenna, upright, zenith_vector
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, steering_vector
 from wbgs_jax.radio.channel import Paths
-from wbgs_jax.radio.geometry import rotation_matrix
+from wbgs_jax.radio.geometry import to_local
 from wbgs_jax.types import Receiver
 
 SHORTEST = 1e-9
@@ -95,14 +95,14 @@ def arrivals(
         slabs: materials of the facets at this frequency.
         frequency_hz: of the carrier.
         receiver: the receiver at the end of the paths.
-        transports: transport of the mechanism of each set of paths (`mechanisms.Mechanism`); static under `jax.jit`.
+        transports: those of the sets of paths (`mechanisms.transports_of`); static under `jax.jit`.
         transmitter: its antenna in the world frame; by default vertically polarised and isotropic.
         element: an antenna factor of every array element in addition to its given pattern, in the receiver's frame; by default
             vertically polarised and isotropic, which changes nothing.
     """
     isotropic = upright(jnp.zeros_like(receiver.pattern_exponents))
     transmitter, element = transmitter or isotropic, element or isotropic
-    # Everything but the transport is computed for all mechanisms together: a program of half the size.
+    # Everything but the transport is computed for all mechanisms together: a program smaller by a quarter.
     whole = paths.together
     # Padded paths may have segments of zero length, whose directions have no derivative.
     somewhere = jnp.asarray(SOMEWHERE, whole.points.dtype)
@@ -119,9 +119,9 @@ def arrivals(
     field, spreading = map(jnp.concatenate, zip(*arrived, strict=True))
     last = last_segment(whole)
     arrival = segments.direction[jnp.arange(len(last)), last]
-    rotation, wavelength = rotation_matrix(receiver.orientation), SPEED_OF_LIGHT / frequency_hz
-    local, here = (jnp.matmul(world, rotation, precision=EXACT) for world in (-arrival, field))
-    own, theta = _element_field(receiver.antenna, element, local), zenith_vector(local)
+    local, here = to_local(-arrival, receiver.orientation), to_local(field, receiver.orientation)
+    theta, wavelength = zenith_vector(local), SPEED_OF_LIGHT / frequency_hz
+    own = _element_field(receiver.antenna, element, local)
     parts = jnp.stack([_dot(here, basis) for basis in (own, theta, jnp.cross(local, theta))], -1)
     scale = wavelength / (4 * jnp.pi) * spreading * phasor(-segments.total / wavelength)
     amplitudes = jnp.where(whole.alive[:, None], scale[:, None] * parts, 0)

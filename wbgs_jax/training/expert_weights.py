@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params, components_of
+from wbgs_jax.fields.losses import COARSE
 from wbgs_jax.fields.mixture import (
     ExpertPredictions,
     Mixing,
@@ -71,7 +72,9 @@ class ExpertWeights(Hook):
         floor, spectra = 0.0, coherent_alone()
         if pas is not None:
             floor = floor_of(predicted, pas, tx_index)
-            spectra = learn_shares(features, tx_index, observed_predictions(predicted, floor), partial(similarity, pas))
+            spectra = learn_shares(
+                features, tx_index, observed_predictions(predicted, floor), partial(similarity, pas, stride=COARSE)
+            )
         known = measured_db is not None and np.any(measured_db > NO_PATH_DB)
         power = coherent_alone() if not known else learn_shares(features, tx_index, powers, partial(nearness, measured_db))
         report = {name: reported(shares, features) for name, shares in (("spectra", spectra), ("power", power))}

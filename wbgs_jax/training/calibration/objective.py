@@ -78,7 +78,9 @@ def make_scores(
         spectra: indices of the links.
         compared: the compared quantity.
     """
-    by, spectra = np.int32(get_args(Compared).index(comparable(compared, data))), np.asarray(spectra, np.int32)
+    quantity, spectra = comparable(compared, data), np.asarray(spectra, np.int32)
+    assert quantity != "powers" or field.config.coherent, "a field without phases predicts no power"
+    by = np.int32(get_args(Compared).index(quantity))
 
     @functools.cache
     def common() -> tuple[Calibratable, PreparedPaths]:
