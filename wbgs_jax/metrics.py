@@ -2,6 +2,7 @@
 strongest direction, and the power lost by choosing beams from predicted spectra.
 """
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -44,7 +45,8 @@ def ssim(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 9
 
     if len(predicted) != len(truth):
         raise ValueError(f"{len(predicted)} spectra cannot be compared with {len(truth)}")
-    with ThreadPoolExecutor() as threads:  # its filters release the interpreter's lock
+    # Its filters release the interpreter's lock; more threads than processors wait for each other's memory.
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
         return np.array(list(threads.map(one, predicted, truth)), np.float64)
 
 

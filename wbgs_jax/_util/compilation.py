@@ -53,6 +53,15 @@ def use_compilation_cache() -> Path | None:
     return folder
 
 
+def has_compiled(function: str) -> bool:
+    """Returns whether the cache in use contains a program of a compiled function, by its name: if one has been compiled before,
+    so have most others of the same command."""
+    import jax
+
+    folder = getattr(jax.config, "jax_compilation_cache_dir", None)
+    return folder is not None and any(Path(folder).glob(f"jit_{function}-*"))
+
+
 def limit_size(folder: Path, most: float | int = 2e9) -> None:
     """Removes the least recently used files of a cache until the others have at most `most` bytes."""
     entries = []

@@ -240,10 +240,11 @@ def evaluate(
             one.result()
     report = {"scene": dataset.name, "field": trained.origin()["field"], "part": part}
     power_db = power_of(predictions, dataset)
-    power = None if power_db is None else power_figures(power_db, reference, index)
-    if power_db is not None and power and trained.power_intervals and tested:  # fitted to the validation part
-        power |= {"confidence_db": calibrate_power(trained.power_intervals, power_db, dataset, index)}
-    own = own_scores(predictions, dataset, index)
+    with Pulse(lambda: "scores of received power and of snapshots", shown):
+        power = None if power_db is None else power_figures(power_db, reference, index)
+        if power_db is not None and power and trained.power_intervals and tested:  # fitted to the validation part
+            power |= {"confidence_db": calibrate_power(trained.power_intervals, power_db, dataset, index)}
+        own = own_scores(predictions, dataset, index)
     if not dataset.has_spectra:
         return report | own | (power or {}) | time_queries(calls), np.asarray(predictions.pas)
     truth = np.asarray(dataset.pas(index))

@@ -146,8 +146,9 @@ class Field(ABC):
     """Name in command lines and files."""
     presets: ClassVar[Mapping[str, Settings]] = PRESETS
     """Settings by preset; `Settings.field` has the type of `config`."""
-    seconds: ClassVar[Mapping[str, float]] = {}
-    """Training times on two cores of an AMD EPYC, by preset, including calibration and compilation (scenes 1 to 6)."""
+    seconds: ClassVar[Mapping[str, tuple[float, float]]] = {}
+    """Training times on two cores of an AMD EPYC at 2 GHz, by preset (scenes 1 to 6): with programs compiled before, and with
+    their compilation."""
     outputs: ClassVar[tuple[Output, ...]] = ("pas",)
     """Quantities that it predicts for a link; `outputs_of` returns those of a field whose scene lacks a component."""
     hooks: ClassVar[tuple[str, ...]] = ()

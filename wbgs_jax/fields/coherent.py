@@ -110,7 +110,7 @@ class WaveField(Calibratable):
     presets: ClassVar = PRESETS
     outputs: ClassVar = ("pas", "snapshots", "power", "paths")
     hooks: ClassVar = ("calibration",)
-    seconds: ClassVar = {"cpu": 170.0, "smoke": 35.0}
+    seconds: ClassVar = {"cpu": (350.0, 400.0), "smoke": (44.0, 81.0)}
 
     @classmethod
     def build(cls, config: WaveConfig, scene: Scene, seed: int) -> "WaveField":

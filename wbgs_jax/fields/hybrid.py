@@ -111,7 +111,7 @@ class HybridField(Field):
     outputs: ClassVar = WaveField.outputs
     components: ClassVar = {"wideband": WidebandField, "wave": WaveField}
     hooks: ClassVar = ("wideband.density", "wave.calibration", "expert_weights")
-    seconds: ClassVar = {"cpu": 315.0, "smoke": 125.0}
+    seconds: ClassVar = {"cpu": (380.0, 520.0), "smoke": (92.0, 160.0)}
 
     @classmethod
     def build(cls, config: HybridConfig, scene: Scene, seed: int) -> "HybridField":

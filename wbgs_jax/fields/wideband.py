@@ -101,7 +101,7 @@ class WidebandField(Field):
     presets: ClassVar = with_field(PRESETS, CONFIGS, density=DENSITY, optim=OPTIM) | {"paper": PAPER}
     outputs: ClassVar = ("pas", "power")
     hooks: ClassVar = ("density",)
-    seconds: ClassVar = {"cpu": 180.0, "smoke": 30.0}
+    seconds: ClassVar = {"cpu": (350.0, 380.0), "smoke": (56.0, 79.0)}
 
     @classmethod
     def build(cls, config: WidebandConfig, scene: Scene, seed: int) -> "WidebandField":

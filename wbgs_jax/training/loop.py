@@ -26,6 +26,7 @@ from jaxtyping import Int
 from wbgs_jax._util.compilation import give_back
 from wbgs_jax._util.devices import any_process, by_first, check_alike, devices_for, is_first
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.progress_lines import Pulse
 from wbgs_jax.config import Settings
 from wbgs_jax.data.dataset import Dataset, check_checksum, checksum
 from wbgs_jax.data.scene import DatasetScene
@@ -464,11 +465,13 @@ def train(
     kind = get_field(field)
     check_data(dataset, kind)
     settings = limited(settings, dataset, kind)
-    run = Run(dataset, field, settings, seed, folder, devices)
-    resumed = resume and run.restore()
-    check_alike((run.state, run.field), "the initial state of training")
+    shown = shown and is_first()
+    with Pulse(lambda: "preparing the field and its data", shown):
+        run = Run(dataset, field, settings, seed, folder, devices)
+        resumed = resume and run.restore()
+        check_alike((run.state, run.field), "the initial state of training")
     total = settings.optim.steps
-    progress = TrainingProgress(total, run.step, shown and is_first())
+    progress = TrainingProgress(total, run.step, shown)
     with deferred_interrupt() as interrupt, run.precompilation, progress:
         if not resumed:
             _begin(run, progress, interrupt)

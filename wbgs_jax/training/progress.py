@@ -24,6 +24,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from wbgs_jax._util.compilation import has_compiled
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.progress_lines import Bar, Pulse
 from wbgs_jax.fields import Field
@@ -100,9 +101,9 @@ class TrainingProgress:
             self.started, self.start_step = time.monotonic(), step
 
 
-PROBE_SECONDS = 0.0095
-"""Time of `_probe` on the reference machine, two cores of an AMD EPYC."""
-SIZE, PRODUCTS, TRIALS = 512, 8, 15
+PROBE_SECONDS = 0.0112
+"""Time of `_probe` on the reference machine, two cores of an AMD EPYC at 2 GHz."""
+SIZE, ROUNDS, TRIALS = 2**19, 8, 9
 
 
 def expected_seconds(field: type[Field], preset: str, share: float = 1.0) -> float | None:
@@ -113,8 +114,10 @@ def expected_seconds(field: type[Field], preset: str, share: float = 1.0) -> flo
         preset: name of the preset.
         share: fraction of the preset's steps that remain.
     """
-    known = field.seconds.get(preset)
-    return None if known is None or jax.default_backend() != "cpu" else known * share * _probe() / PROBE_SECONDS
+    if preset not in field.seconds or jax.default_backend() != "cpu":
+        return None
+    compiled, uncompiled = field.seconds[preset]
+    return (compiled if has_compiled("run_epoch") else uncompiled) * share * _probe() / PROBE_SECONDS
 
 
 def duration_words(seconds: float) -> str:
@@ -128,12 +131,13 @@ def duration_words(seconds: float) -> str:
 
 
 def _probe() -> float:
-    """Returns the median time of a few matrix products, seconds; it includes the effect of other running programs."""
+    """Returns the median time of functions of large arrays, seconds, which the other programs on the machine slow down as they
+    do the steps of a training. (Matrix products are slowed down more.)"""
 
-    def products(x: jax.Array) -> jax.Array:
-        return jax.lax.fori_loop(0, PRODUCTS, lambda _, y: jnp.tanh(y @ x) / SIZE, x)
+    def functions(x: jax.Array) -> jax.Array:
+        return jax.lax.fori_loop(0, ROUNDS, lambda _, y: jnp.exp(-jnp.abs(y)) * jnp.sin(y) + 0.1, x)
 
-    run, x, times = jax.jit(products), jnp.ones((SIZE, SIZE)), []
+    run, x, times = jax.jit(functions), jnp.linspace(0, 1, SIZE), []
     run(x).block_until_ready()
     for _ in range(TRIALS):
         start = time.perf_counter()
