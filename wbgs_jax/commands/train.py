@@ -32,7 +32,7 @@ from wbgs_jax.fields.base import check_config
 from wbgs_jax.inference.intervals import write_confidence
 from wbgs_jax.inference.kriging import write_neighbours
 from wbgs_jax.inference.trained_field import RunConfig, TrainedField
-from wbgs_jax.training.batches import check_data, limited
+from wbgs_jax.training.batches import check_data, knows_no_paths, limited
 from wbgs_jax.training.checkpoint import checkpoint_steps
 from wbgs_jax.training.cross_validation import Training, is_few, learn_few
 from wbgs_jax.training.fit_intervals import learn_confidence
@@ -249,7 +249,7 @@ def _train(command: Command, settings: Settings) -> None:
         if steps:
             tell(f"continuing from the checkpoint of step {steps[-1]}")
         total = limited(config.settings, dataset, get_field(config.field)).optim.steps
-        for line in opening_lines(folder, config, total, steps[-1] if steps else 0):
+        for line in opening_lines(folder, config, dataset, total, steps[-1] if steps else 0):
             tell(line)
         try:
             result = train(dataset, config.field, config.settings, config.seed, folder, command.resume, command.devices)
@@ -265,11 +265,13 @@ def _nothing(line: str) -> None:
     """Ignores a line, on all processes but the first."""
 
 
-def opening_lines(folder: Path, config: RunConfig, steps: int, done: int) -> list[str]:
+def opening_lines(folder: Path, config: RunConfig, dataset: Dataset, steps: int, done: int) -> list[str]:
     """Returns lines with the expected duration of the remaining steps, `done` being complete, and the results folder."""
-    field = get_field(config.field)
-    usual = field.presets[config.preset].optim
+    field, usual = get_field(config.field), get_field(config.field).presets[config.preset].optim
     share = max(steps - done, 0) / (usual.steps * usual.share_with_paths)
+    if knows_no_paths(dataset, field):
+        field = next((part for part in field.components.values() if "paths" not in part.outputs), field)
+        share *= usual.share_with_paths * (2 if config.neighbours and is_few(dataset) else 1)  # those of cross-validation
     seconds = expected_seconds(field, config.preset, share)
     lasts = "the lines below show the remaining time" if seconds is None else f"{duration_words(seconds)} on this machine"
     return [

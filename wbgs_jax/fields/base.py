@@ -35,6 +35,17 @@ Output = Literal["pas", "snapshots", "power", "paths"]
 """A quantity that a field may predict for a link."""
 
 
+class TrainingTime(NamedTuple):
+    """Seconds that a training takes on the reference machine."""
+
+    steps: float
+    """All steps of the preset."""
+    others: float
+    """Preparation, calibration and validation, with programs that have been compiled before."""
+    compiling: float
+    """Additional seconds if they have not."""
+
+
 class Observation(NamedTuple):
     """A field's predictions for B links of one receiver."""
 
@@ -146,9 +157,8 @@ class Field(ABC):
     """Name in command lines and files."""
     presets: ClassVar[Mapping[str, Settings]] = PRESETS
     """Settings by preset; `Settings.field` has the type of `config`."""
-    seconds: ClassVar[Mapping[str, tuple[float, float]]] = {}
-    """Training times on two cores of an AMD EPYC at 2 GHz, by preset (scenes 1 to 6): with programs compiled before, and with
-    their compilation."""
+    seconds: ClassVar[Mapping[str, TrainingTime]] = {}
+    """Training times on two cores of an AMD EPYC at 2 GHz, by preset (scenes 1 to 6)."""
     outputs: ClassVar[tuple[Output, ...]] = ("pas",)
     """Quantities that it predicts for a link; `outputs_of` returns those of a field whose scene lacks a component."""
     hooks: ClassVar[tuple[str, ...]] = ()

@@ -19,7 +19,17 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Key
 
 from wbgs_jax._util.pytree import pytree, replaced, static, to_device
-from wbgs_jax.fields.base import Aux, Group, Inspection, MaterialProperties, Observation, compare, register, without_unreceived
+from wbgs_jax.fields.base import (
+    Aux,
+    Group,
+    Inspection,
+    MaterialProperties,
+    Observation,
+    TrainingTime,
+    compare,
+    register,
+    without_unreceived,
+)
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import (
     Materials,
@@ -110,7 +120,7 @@ class WaveField(Calibratable):
     presets: ClassVar = PRESETS
     outputs: ClassVar = ("pas", "snapshots", "power", "paths")
     hooks: ClassVar = ("calibration",)
-    seconds: ClassVar = {"cpu": (350.0, 400.0), "smoke": (44.0, 81.0)}
+    seconds: ClassVar = {"cpu": TrainingTime(60, 90, 100), "smoke": TrainingTime(6, 38, 37)}
 
     @classmethod
     def build(cls, config: WaveConfig, scene: Scene, seed: int) -> "WaveField":

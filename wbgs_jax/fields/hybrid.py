@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Key
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree, replaced, static
 from wbgs_jax.config import Settings
-from wbgs_jax.fields.base import Aux, Field, Group, Inspection, Observation, register
+from wbgs_jax.fields.base import Aux, Field, Group, Inspection, Observation, TrainingTime, register
 from wbgs_jax.fields.coherent import WaveConfig, WaveField
 from wbgs_jax.fields.coherent_model import PreparedPaths
 from wbgs_jax.fields.mixture import (
@@ -111,7 +111,7 @@ class HybridField(Field):
     outputs: ClassVar = WaveField.outputs
     components: ClassVar = {"wideband": WidebandField, "wave": WaveField}
     hooks: ClassVar = ("wideband.density", "wave.calibration", "expert_weights")
-    seconds: ClassVar = {"cpu": (380.0, 520.0), "smoke": (92.0, 160.0)}
+    seconds: ClassVar = {"cpu": TrainingTime(265, 115, 140), "smoke": TrainingTime(25, 67, 68)}
 
     @classmethod
     def build(cls, config: HybridConfig, scene: Scene, seed: int) -> "HybridField":

@@ -24,6 +24,7 @@ from wbgs_jax.fields.base import (
     Group,
     Inspection,
     Observation,
+    TrainingTime,
     compare,
     power_error_db,
     register,
@@ -101,7 +102,7 @@ class WidebandField(Field):
     presets: ClassVar = with_field(PRESETS, CONFIGS, density=DENSITY, optim=OPTIM) | {"paper": PAPER}
     outputs: ClassVar = ("pas", "power")
     hooks: ClassVar = ("density",)
-    seconds: ClassVar = {"cpu": (350.0, 380.0), "smoke": (56.0, 79.0)}
+    seconds: ClassVar = {"cpu": TrainingTime(330, 27, 22), "smoke": TrainingTime(22, 34, 23)}
 
     @classmethod
     def build(cls, config: WidebandConfig, scene: Scene, seed: int) -> "WidebandField":

@@ -112,12 +112,13 @@ def expected_seconds(field: type[Field], preset: str, share: float = 1.0) -> flo
     Args:
         field: class of the field.
         preset: name of the preset.
-        share: fraction of the preset's steps that remain.
+        share: number of steps, relative to the preset's.
     """
-    if preset not in field.seconds or jax.default_backend() != "cpu":
+    known = field.seconds.get(preset)
+    if known is None or jax.default_backend() != "cpu":
         return None
-    compiled, uncompiled = field.seconds[preset]
-    return (compiled if has_compiled("run_epoch") else uncompiled) * share * _probe() / PROBE_SECONDS
+    compiling = 0 if has_compiled("run_epoch") else known.compiling
+    return (known.steps * share + known.others + compiling) * _probe() / PROBE_SECONDS
 
 
 def duration_words(seconds: float) -> str:
