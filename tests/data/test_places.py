@@ -90,6 +90,13 @@ def test_without_surfaces_places_nearby_keep_their_confidence():
     np.testing.assert_array_equal(domain.outside(places), [False, True])
 
 
+def test_places_of_the_test_belong_to_no_domain_without_surfaces():
+    dataset = dataclasses.replace(tiny_dataset(), faces=np.zeros((0, 3), np.int32), face_part=None, materials=None)
+    far = dataset.tx_positions.copy()
+    far[dataset.test] += 100
+    np.testing.assert_array_equal(domain_of(dataclasses.replace(dataset, tx_positions=far)).outside(far[dataset.test]), True)
+
+
 @pytest.mark.parametrize("n", [0, 1])
 def test_no_place_is_none(n):
     body = ClosedBody("box", trimesh.creation.box((1, 1, 1)).triangles)

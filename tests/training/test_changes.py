@@ -21,6 +21,7 @@ from wbgs_jax.training.calibration.changes import (
     middle_of,
     notice,
     objects_of,
+    power_change_db,
     with_object_moved,
     without_object,
 )
@@ -116,6 +117,22 @@ def test_data_survive_a_scene_file(run):
     both = with_links(data, data.train[1:], some)  # the first old link is missing
     file = scene_dataset(scene_of(both, "nowhere"))
     assert len(file) == len(both) and len(file.train) == len(both.train)
+
+
+def test_a_room_without_objects_has_no_changes(run, monkeypatch):
+    monkeypatch.setattr("wbgs_jax.training.calibration.changes.objects_of", lambda _: [])
+    params = of_concrete(run)
+    field, same, changes = find_changes(CalibrationProblem(run.field, run.prepared, run.data, np.arange(4)), params, 1e-3)
+    assert field is run.field and same is params and not changes
+
+
+def test_silent_links_do_not_decide_the_gain(rng):
+    """Power that changed by 3 dB everywhere; one transmitter of ten fell silent, which counts as 30 dB."""
+    seen = evidence(rng, 20)
+    new = seen.group == Group.NEW
+    change = np.where(np.cumsum(new) % 10 == 1, -30.0, 3.0)
+    power = np.where(new, change, 0.0) + 0.1 * rng.normal(size=len(new))
+    assert power_change_db(dataclasses.replace(seen, power_db=power)) == pytest.approx(3, abs=0.5)
 
 
 @pytest.mark.heavy

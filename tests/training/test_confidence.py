@@ -12,12 +12,13 @@ from builders.untrained import make_field, make_params
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.splits import hold_out_validation
-from wbgs_jax.evaluation.score import calibrate_power, calibration, expectations
+from wbgs_jax.evaluation.score import calibrate_power, calibration, expectations, power_calibration
 from wbgs_jax.inference.intervals import (
     FILE,
     POWER_MARGIN_DB,
     Confidence,
     Expected,
+    ExpectedPower,
     PowerConfidence,
     expect_many,
     expected_power,
@@ -25,6 +26,7 @@ from wbgs_jax.inference.intervals import (
     features,
     read_confidence,
     read_power_confidence,
+    scaled_features,
     write_confidence,
 )
 from wbgs_jax.inference.kriging import for_receiver
@@ -156,6 +158,50 @@ def test_calibration_reports_what_it_says(rng):
     assert calibration(wrong, scores, 0.9)["coverage"] < 0.2 and calibration(wrong, scores, 0.9)["risk_coverage"]["0.1"] < 0.5
 
 
+def test_predictions_without_an_expectation_are_not_counted(rng):
+    scores = np.append(rng.uniform(0.3, 0.9, 20), -0.02)
+    expected = Expected(scores.clip(0), scores.clip(0) - 0.01, scores.clip(0) + 0.01)
+    expected.low[-1] = 0
+    there = calibration(expected, scores, 0.9)
+    assert there["coverage"] == 1  # a score below 0 counts as 0
+    at_receiver = Expected(*(np.append(values, np.nan) for values in expected))
+    assert calibration(at_receiver, np.append(scores, 0.1), 0.9) == there
+    assert calibration(Expected(*np.full((3, 1), np.nan)), scores[:1], 0.9) is None
+    errors = rng.uniform(0, 3, 20)
+    powers = ExpectedPower(np.append(errors, np.nan), np.append(errors + 0.1, np.nan))
+    assert power_calibration(powers, np.append(errors, 50), 0.9)["coverage"] == 1
+    assert power_calibration(ExpectedPower(*np.full((2, 1), np.nan)), errors[:1], 0.9) is None
+
+
+def test_a_feature_that_does_not_vary_is_left_out(rng):
+    """Transmitters of a grid are equally far from the next one, up to rounding, which must not be learned from."""
+    known, error, tx = drawn(rng, 40)
+    known[:, 0] = np.log(0.5) + 1e-7 * known[:, 0]
+    mean, scale, weights, rest = fit(known, error, tx, SETS)
+    assert scale[0] == np.inf and np.isfinite(weights).all() and np.isfinite(rest).all()
+    off_the_grid = np.append(np.log(0.2), known[0, 1:])
+    np.testing.assert_array_equal(scaled_features(off_the_grid, mean, scale), scaled_features(known[0], mean, scale))
+
+
+def test_intervals_do_not_extrapolate():
+    far = np.array([[3.0, -50.0, 1e9]])
+    np.testing.assert_array_equal(scaled_features(far, np.zeros(3), np.ones(3)), [[3, -4, 4]])
+
+
+def test_corrected_spectra_have_intervals_where_they_are_corrected(rng, tmp_path):
+    pas = jnp.asarray(rng.uniform(0, 1, (2, 90, 360)), jnp.float32)
+    query = Query(jnp.ones((2, 3)), jnp.array([2.4e9, 2.5e9]))
+    corrected = dataclasses.replace(confidence(), frequency_hz=jnp.array([2.4e9, 28e9]))
+    everywhere, some = (expected_ssim(one, pas, query) for one in (confidence(), corrected))
+    assert np.isfinite(everywhere).all()
+    np.testing.assert_array_equal(np.isnan(some), [[False, True]] * 3)
+    write_confidence(tmp_path, corrected)
+    np.testing.assert_array_equal(read_confidence(tmp_path).frequency_hz, corrected.frequency_hz)
+    arrays = {name: values for name, values in np.load(tmp_path / FILE).items() if name != "frequency_hz"}
+    np.savez(tmp_path / FILE, **arrays)  # as written by earlier versions
+    assert read_confidence(tmp_path).frequency_hz.shape == (0,)
+
+
 @pytest.fixture(scope="module")
 def dataset():
     return hold_out_validation(tiny_dataset(30))
@@ -224,7 +270,7 @@ def confidence():
     return Confidence(
         *(
             jnp.asarray(a, jnp.float32)
-            for a in (np.zeros(3), np.eye(3), np.zeros(k), np.ones(k), np.full(k + 1, -0.1), (-1, 1), 1.2, 0.9)
+            for a in (np.zeros(3), np.eye(3), np.zeros(k), np.ones(k), np.full(k + 1, -0.1), (-1, 1), 1.2, 0.9, ())
         )
     )
 

@@ -2,14 +2,16 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 from builders.synthetic import tiny_dataset
-from builders.toys import toy_settings
+from builders.toys import RippleConfig, RippleField, toy_settings
 
 from wbgs_jax.data.splits import hold_out_validation, training_links
 from wbgs_jax.training import cross_validation
-from wbgs_jax.training.cross_validation import FOLDS, blocks, held_out_blocks, shortened
+from wbgs_jax.training.cross_validation import FOLDS, Training, blocks, held_out_blocks, is_few, learn_few, shortened
+from wbgs_jax.training.fit_mixture import Found, start_mixture
 
 pytestmark = pytest.mark.usefixtures("ripple")
 
@@ -61,7 +63,7 @@ def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
     first = held_out_blocks(*asked, lambda line: None)
     monkeypatch.setattr(cross_validation, "train", lambda *_, **__: pytest.fail("trained again"))
     second = held_out_blocks(*asked, lambda line: None)
-    np.testing.assert_allclose(first.pas, second.pas, atol=1e-3)
+    np.testing.assert_array_equal(first.pas, second.pas)
 
 
 def test_one_transmitter_cannot_be_left_out(tmp_path):
@@ -69,6 +71,49 @@ def test_one_transmitter_cannot_be_left_out(tmp_path):
     one = dataset.train[dataset.tx_index[dataset.train] == dataset.tx_index[dataset.train[0]]]
     alone = dataclasses.replace(dataset, train=one)
     assert not len(held_out_blocks(alone, "ripple", toy_settings(), 0, tmp_path, 0, print).links)
+
+
+@pytest.fixture
+def learned(tmp_path, monkeypatch):
+    """Calls `learn_few` for a toy field whose mixture is chosen by `found`."""
+    dataset = hold_out_validation(tiny_dataset(15))
+    settings = toy_settings()
+    field = RippleField(RippleConfig())
+    seen = []
+
+    def learn(alone: bool, distance=1.0):
+        def found(_, known, held, with_paths):
+            seen.append(held)
+            scores = np.linspace(0.4, 0.9, len(held.links))
+            return Found(start_mixture(dataset, known, 1.0), scores, held.pas, np.full(len(scores), distance), alone, "line")
+
+        monkeypatch.setattr(cross_validation, "learn_mixture", found)
+        how = Training("ripple", settings, 8, 0, tmp_path)
+        return dataset, learn_few(field, field.init(jax.random.key(0)), dataset, how, print), seen[-1]
+
+    return learn
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_blocks_alone_decide_and_give_the_intervals(learned, alone):
+    """Not the validation part, which lies between training transmitters."""
+    dataset, few, held = learned(alone)
+    assert set(held.group) == set(range(FOLDS)) and len(np.unique(held.links)) == len(held.links)
+    assert few.confidence is not None and (few.mixture is None) == alone
+    frequencies = () if alone else np.unique(dataset.frequencies_hz[training_links(dataset)])
+    np.testing.assert_allclose(few.confidence.frequency_hz, frequencies, rtol=1e-6)
+
+
+def test_links_without_measurements_at_their_frequency_give_no_intervals(learned):
+    assert learned(False, np.inf)[1].confidence is None
+
+
+def test_many_transmitters_are_not_few_whatever_is_held_out():
+    few, many = hold_out_validation(tiny_dataset(30)), tiny_dataset(280, kind="power")
+    assert is_few(few) and is_few(dataclasses.replace(few, validation=few.validation[:0]))
+    assert not is_few(many)  # powers alone
+    spectra = dataclasses.replace(few, tx_index=np.arange(len(few)))
+    assert is_few(spectra) == (len(training_links(spectra)) < 200)
 
 
 def test_short_trainings_have_whole_epochs():

@@ -98,6 +98,18 @@ def test_weights_follow_the_distance(rng):
     assert found[0, 1] - found[1, 1] < -0.5
 
 
+def test_kriging_is_chosen_where_transmitters_have_unequal_numbers_of_frequencies(monkeypatch, dataset, known, members):
+    """Transmitters count alike: two with many poor links hide neither the best choice nor its standard error."""
+    first = np.unique(dataset.tx_index[known.links], return_index=True)[1][:4]
+    index = np.repeat(known.links[first], [20, 20, 1, 1])
+    scores = np.repeat([0.3, 0.31, 0.9, 0.91], [20, 20, 1, 1])
+    monkeypatch.setattr(module, "predict_members", lambda *_: (np.zeros((len(index), 1, 90, 360)), None))
+    monkeypatch.setattr(module, "moments_of", lambda *_: None)
+    monkeypatch.setattr(module, "ssim_of", lambda *_: jnp.asarray(scores))
+    found = module._kriged(members, dataset, known, index, np.ones((len(index), len(known.links)), bool))
+    assert float(found.length) == pytest.approx(module._reach(dataset.tx_positions[known.links])[1])
+
+
 def test_no_transmitter_explains_itself(dataset, known):
     index, kept = left_out(dataset, known)
     tx = dataset.tx_index

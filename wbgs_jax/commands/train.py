@@ -297,7 +297,8 @@ def learn_beside(result: TrainResult, dataset: Dataset, config: RunConfig, folde
             write_neighbours(folder, few.mixture)
             say(few.line)
             of_spectra, of_powers = learn_confidence(*trained, None)
-            write_confidence(folder, of_spectra if few.mixture is None else few.confidence, of_powers)
+            fitted = few.mixture is not None or few.confidence is not None
+            write_confidence(folder, few.confidence if fitted else of_spectra, of_powers)
         return
     with Pulse(lambda: "validation: correction by measured spectra nearby, prediction intervals") as pulse:
         pulse.print()

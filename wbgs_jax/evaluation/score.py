@@ -55,32 +55,40 @@ COVERAGES = (1.0, 0.9, 0.75, 0.5, 0.25, 0.1)
 """Fractions of the predictions, the most certain ones first, whose mean score is reported."""
 
 
-def calibration(expected: Expected, scores: Float[np.ndarray, " n"], level: float) -> dict[str, Any]:
+def calibration(expected: Expected, scores: Float[np.ndarray, " n"], level: float) -> dict[str, Any] | None:
     """Returns a comparison of expected and actual SSIM: `coverage` of the intervals and their mean `width`, the mean `expected`
     and actual (`scored`) SSIM, their rank `correlation` (Spearman), and the `risk_coverage` curve: the mean SSIM of the most
-    certain fractions.
+    certain fractions. Predictions without an expectation (NaN, at the receiver) are left out; None if there are no others.
 
     Args:
         expected: expectation and interval of every prediction.
         scores: actual SSIM.
         level: nominal coverage of the intervals.
     """
-    expectation, low, high = (np.asarray(values, np.float64) for values in expected)
-    covered = (low <= scores) & (scores <= high)
+    known = np.isfinite(expected.ssim)  # not at the receiver
+    if not known.any():
+        return None
+    expectation, low, high = (np.asarray(values, np.float64)[known] for values in expected)
+    scores = scores[known]
+    covered = (low <= scores.clip(0)) & (scores <= high)  # a score below 0 counts as 0
     return _figures(expectation, scores, -expectation, covered, level) | {"width": float(np.mean(np.minimum(high, 1) - low))}
 
 
-def power_calibration(expected: ExpectedPower, errors_db: Float[np.ndarray, " n"], level: float) -> dict[str, Any]:
+def power_calibration(expected: ExpectedPower, errors_db: Float[np.ndarray, " n"], level: float) -> dict[str, Any] | None:
     """Returns a comparison of expected and actual absolute errors of received powers (dB): `coverage` of the error bounds and
     their mean `within_db`, the mean `expected` and actual (`scored`) error, their rank `correlation`, and the `risk_coverage`
-    curve: the mean error of the most certain fractions.
+    curve: the mean error of the most certain fractions. Predictions without an expectation are left out, as in `calibration`.
 
     Args:
         expected: expected error and error bound of every prediction.
         errors_db: actual absolute errors.
         level: nominal coverage of the bounds.
     """
-    expectation, within = (np.asarray(values, np.float64) for values in expected)
+    known = np.isfinite(expected.error_db)
+    if not known.any():
+        return None
+    expectation, within = (np.asarray(values, np.float64)[known] for values in expected)
+    errors_db = errors_db[known]
     return _figures(expectation, errors_db, expectation, errors_db <= within, level) | {"within_db": float(within.mean())}
 
 
@@ -243,7 +251,8 @@ def evaluate(
     with Pulse(lambda: "scores of received power and of snapshots", shown):
         power = None if power_db is None else power_figures(power_db, reference, index)
         if power_db is not None and power and trained.power_intervals and tested:  # fitted to the validation part
-            power |= {"confidence_db": calibrate_power(trained.power_intervals, power_db, dataset, index)}
+            calibrated = calibrate_power(trained.power_intervals, power_db, dataset, index)
+            power |= {} if calibrated is None else {"confidence_db": calibrated}
         own = own_scores(predictions, dataset, index)
     if not dataset.has_spectra:
         return report | own | (power or {}) | time_queries(calls), np.asarray(predictions.pas)
@@ -262,7 +271,8 @@ def evaluate(
             and intervals is not None
             and (expected := expectations(intervals, dataset, index, np.asarray(predictions.pas), power_db))
         ):
-            report["confidence"] = calibration(expected, ssim, float(intervals.level))  # scored as it was fitted
+            calibrated = calibration(expected, ssim, float(intervals.level))  # scored as it was fitted
+            report |= {} if calibrated is None else {"confidence": calibrated}
         report |= time_queries(calls)
     return report, np.asarray(predictions.pas)
 

@@ -16,6 +16,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import map_blocks
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.scene import DatasetScene, closed_bodies
+from wbgs_jax.data.splits import without_test
 from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.fields.base import Params, outputs_of, paths_of
 from wbgs_jax.inference.domain import Domain
@@ -118,7 +119,7 @@ class LoadedField:
 
 def domain_of(dataset: Dataset) -> Domain:
     """Returns the positions and frequencies that a training on a dataset covers."""
-    box = np.asarray(DatasetScene(dataset).box, np.float64)
+    box = np.asarray(DatasetScene(without_test(dataset)).box, np.float64)
     beyond = 0.0 if len(dataset.faces) else 0.5 * float(np.linalg.norm(box[1] - box[0]))
     return Domain(dataset.name, box, trained_band(dataset), beyond, closed_bodies(dataset))
 

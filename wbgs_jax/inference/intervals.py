@@ -11,6 +11,7 @@ below 0 counts as 0, so that all expected scores and ends of intervals lie betwe
 field were learned on the same transmitters, for which its predictions are slightly too good.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,7 +22,8 @@ from jaxtyping import Array, Bool, Float
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_tree, write_tree
-from wbgs_jax._util.pytree import map_blocks, pytree
+from wbgs_jax._util.pytree import AnyArray, map_blocks, pytree
+from wbgs_jax.inference.kriging import SAME_FREQUENCY
 from wbgs_jax.radio.array import EXACT
 from wbgs_jax.radio.channel import beyond_free_space_db
 from wbgs_jax.types import Query, Transmitter
@@ -47,7 +49,7 @@ class Confidence:
     mean: Float[Array, " k"]
     """Means of the features ..."""
     scale: Float[Array, " k"]
-    """... and their standard deviations."""
+    """... and their standard deviations, infinite for those that do not vary."""
     weights: Float[Array, " k+1"]
     """Weights of the scaled features, then the intercept; zero for features that do not improve the regression."""
     quantiles: Float[Array, "2"]
@@ -56,6 +58,9 @@ class Confidence:
     """Mean of exp(r)."""
     level: Float[Array, ""]
     """Probability that a score lies within the interval: `LEVEL`, or the highest level that the held-out transmitters allow."""
+    frequency_hz: Float[Array, " f"]
+    """Frequencies at which measured spectra correct the field, if they do: at others it answers alone, and there are no
+    intervals. Empty if there is no correction."""
 
 
 @pytree
@@ -67,7 +72,7 @@ class PowerConfidence:
     mean: Float[Array, " k"]
     """Means of the features ..."""
     scale: Float[Array, " k"]
-    """... and their standard deviations."""
+    """... and their standard deviations, infinite for those that do not vary."""
     weights: Float[Array, " k+1"]
     """Weights of the scaled features, then the intercept; zero for features that do not improve the regression."""
     highest: Float[Array, ""]
@@ -145,7 +150,8 @@ def _beyond(power_db: Float[Array, " b"], query: Query, rx_position: Float[Array
 def expected_ssim(
     confidence: Confidence, pas: Float[Array, "b 90 360"], query: Query, power_db: Float[Array, " b"] | None = None
 ) -> Expected:
-    """Returns the expected SSIM of predicted spectra, with intervals; NaN for a transmitter at the receiver.
+    """Returns the expected SSIM of predicted spectra, with intervals; NaN for a transmitter at the receiver, and where measured
+    spectra correct the field at other frequencies only.
 
     Args:
         confidence: the regression, for the queried receiver.
@@ -162,8 +168,11 @@ def expected_ssim(
     error = _log_error(confidence, known)
     low, high = confidence.quantiles
     factors = confidence.surplus, jnp.exp(high), jnp.exp(low)
-    apart = _apart(query, confidence.rx_position)
-    return Expected(*(jnp.where(apart, jnp.clip(1 + MARGIN - jnp.exp(error) * one, 0, 1), jnp.nan) for one in factors))
+    valid = _apart(query, confidence.rx_position)
+    if len(confidence.frequency_hz):
+        apart = jnp.abs(jnp.log(query.frequency_hz[:, None] / confidence.frequency_hz))
+        valid &= jnp.min(apart, -1) < SAME_FREQUENCY
+    return Expected(*(jnp.where(valid, jnp.clip(1 + MARGIN - jnp.exp(error) * one, 0, 1), jnp.nan) for one in factors))
 
 
 def expected_power(
@@ -195,8 +204,15 @@ def _apart(query: Query, rx_position: Float[Array, "*#b 3"]) -> Bool[Array, " b"
 
 def _log_error(confidence: Confidence | PowerConfidence, known: Float[Array, "b k"]) -> Float[Array, " b"]:
     """Returns the logarithm of the error that the regression predicts."""
-    scaled = (known - confidence.mean) / confidence.scale
+    scaled = scaled_features(known, confidence.mean, confidence.scale)
     return jnp.matmul(scaled, confidence.weights[:-1], precision=EXACT) + confidence.weights[-1]
+
+
+def scaled_features(known: AnyArray, mean: AnyArray, scale: AnyArray) -> AnyArray:
+    """Returns features (n, k) relative to their means (k,) in units of their standard deviations (k,), limited: the regression
+    does not extrapolate."""
+    most = 4.0  # standard deviations
+    return ((known - mean) / scale).clip(-most, most)
 
 
 def expect_many(
@@ -230,16 +246,16 @@ def write_confidence(folder: Path, confidence: Confidence | None, of_powers: Pow
 
 def read_confidence(folder: Path) -> Confidence | None:
     """Returns the regression of a run folder, or None. A damaged file, or one of another version, is a `UserError`."""
-    return _read(folder / FILE, Confidence, FEATURES)
+    return _read(folder / FILE, Confidence, FEATURES, {"level": LEVEL, "frequency_hz": ()})
 
 
 def read_power_confidence(folder: Path) -> PowerConfidence | None:
     """Returns the regression for powers; otherwise as `read_confidence`."""
-    return _read(folder / POWER_FILE, PowerConfidence, POWER_FEATURES)
+    return _read(folder / POWER_FILE, PowerConfidence, POWER_FEATURES, {"level": LEVEL})
 
 
-def _read(path: Path, cls: type[C], count: int) -> C | None:
-    found = read_tree(path, (cls,), "do without", {"level": LEVEL})
+def _read(path: Path, cls: type[C], count: int, before: Mapping[str, Any]) -> C | None:
+    found = read_tree(path, (cls,), "do without", before)
     if found is not None and found.mean.shape != (count,):
         raise UserError(f"{path} is of another version; remove it to work without prediction intervals, or train again")
     return found

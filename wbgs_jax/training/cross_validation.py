@@ -24,14 +24,14 @@ from jaxtyping import Bool, Float, Int
 from wbgs_jax._util.files import atomic_write, read_arrays
 from wbgs_jax.config import Settings
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.splits import training_links
+from wbgs_jax.data.splits import VALIDATION, training_links
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.intervals import Confidence, features
 from wbgs_jax.inference.kriging import Mixture
 from wbgs_jax.inference.predictor import as_observed, predict_spectra
 from wbgs_jax.training.batches import knows_no_paths
-from wbgs_jax.training.fit_intervals import confidence_of
+from wbgs_jax.training.fit_intervals import FEWEST, confidence_of
 from wbgs_jax.training.fit_mixture import Found, HeldOut, Known, learn_mixture
 from wbgs_jax.training.hooks import Say
 from wbgs_jax.training.loop import train
@@ -109,11 +109,11 @@ def _answers(
     part = dataclasses.replace(dataset, train=known[~left_out], validation=known[left_out])
     place.mkdir(parents=True, exist_ok=True)
     trained = train(part, field, settings, seed, place, resume=True, devices=devices, shown=False)
-    pas = predict_spectra(trained.field, trained.params, dataset, index)
+    pas = predict_spectra(trained.field, trained.params, dataset, index).astype(np.float16)
     with atomic_write(done) as stream:
-        np.savez_compressed(stream, pas=pas.astype(np.float16))
+        np.savez_compressed(stream, pas=pas)
     shutil.rmtree(place, ignore_errors=True)
-    return index, pas
+    return index, pas.astype(np.float32)  # as it is read after an interruption
 
 
 def shortened(settings: Settings, steps: int) -> Settings:
@@ -146,38 +146,40 @@ class Few(NamedTuple):
     mixture: Mixture | None
     """Mixture with simple methods; None to use the field alone."""
     confidence: Confidence | None
-    """Prediction intervals; None if too few links were held out, or if they are to be fitted on the validation part."""
+    """Prediction intervals; None if too few links were held out, or, without a mixture, if they are to be fitted on the
+    validation part."""
     line: str
     """Summary for the terminal."""
 
 
 def is_few(dataset: Dataset) -> bool:
     """Returns whether a dataset has so few spectra that simple methods are part of the mixture."""
-    validation = np.unique(dataset.tx_index[dataset.validation])
+    held, known = (len(np.unique(dataset.tx_index[links])) for links in (dataset.validation, training_links(dataset)))
     enough = 20  # validation transmitters, from which on the validation part alone is sufficient
-    return dataset.has_spectra and dataset.n_receivers == 1 and len(validation) < enough
+    few = held < enough and known * VALIDATION < enough
+    return dataset.has_spectra and dataset.n_receivers == 1 and few
 
 
 def learn_few(field: Field, params: Params, dataset: Dataset, training: Training, say: Say) -> Few:
     """Returns the mixture and the prediction intervals of a trained field, from cross-validation."""
     no_paths = knows_no_paths(dataset, type(field))
-    known, held = cross_validated(field, params, dataset, training, say)
-    if not len(held.links) and not no_paths:
+    if not len(dataset.validation) and not no_paths:
         return Few(None, None, "no links were held out: the field, which predicts paths, is used alone")
+    known, held = cross_validated(field, params, dataset, training, say)
     found = learn_mixture(dataset, known, held, with_paths=not no_paths)
-    if found.alone:
+    if found.alone and not no_paths:
         return Few(None, None, found.line)
-    return Few(found.mixture, _confidence(dataset, held, found), found.line)
+    return Few(None if found.alone else found.mixture, _confidence(dataset, held, found), found.line)
 
 
 def cross_validated(field: Field, params: Params, dataset: Dataset, training: Training, say: Say) -> tuple[Known, HeldOut]:
     """Returns all measured spectra, and held-out predictions of fields that were not trained on some of them."""
     index = training_links(dataset)
-    held = _validation(field, params, dataset, index)
     if knows_no_paths(dataset, type(field)) and jax.process_count() == 1:
         settings = shortened(training.settings, training.steps)
-        with_blocks = held_out_blocks(dataset, training.field, settings, training.seed, training.folder, training.devices, say)
-        held = _together(with_blocks, held)
+        held = held_out_blocks(dataset, training.field, settings, training.seed, training.folder, training.devices, say)
+    else:
+        held = _validation(field, params, dataset, index)
     return Known(index, dataset.eight_bit(index)), held
 
 
@@ -189,19 +191,17 @@ def _validation(field: Field, params: Params, dataset: Dataset, known: Int[np.nd
     return HeldOut(index, pas.astype(np.float32), np.tile(trained, (len(index), 1)), dataset.tx_index[index])
 
 
-def _together(blocks: HeldOut, validation: HeldOut) -> HeldOut:
-    """Returns the predictions of both, with distinct groups."""
-    group = validation.group + 1 + blocks.group.max(initial=0)
-    return HeldOut(*map(np.concatenate, zip(blocks, validation._replace(group=group), strict=True)))
-
-
 def _confidence(dataset: Dataset, held: HeldOut, found: Found) -> Confidence | None:
-    """Returns prediction intervals of the mixture, from its predictions for held-out links."""
-    if len(np.unique(dataset.tx_index[held.links])) < 2:
+    """Returns prediction intervals of the mixture, from its predictions for held-out links with measurements at their
+    frequency; None if these are too few."""
+    measured = np.isfinite(found.distance)
+    index = held.links[measured]
+    if len(index) < FEWEST or len(np.unique(dataset.tx_index[index])) < 2:
         return None
-    query, receiver = dataset.query(held.links), dataset.receiver()
+    receiver = dataset.receiver()
     trained = jnp.asarray(np.unique(dataset.tx_positions[training_links(dataset)], axis=0), jnp.float32)
-    inputs = features(jnp.asarray(found.answers, jnp.float32), query, receiver.position, trained)
+    inputs = features(jnp.asarray(found.answers[measured], jnp.float32), dataset.query(index), receiver.position, trained)
     known = np.array(inputs, np.float64)
-    known[:, 0] = 0.5 * np.log(found.distance**2 + 1e-4)  # distances to the transmitters that were not left out
-    return confidence_of(known, found.scores, dataset.tx_index[held.links], receiver.position, trained)
+    known[:, 0] = 0.5 * np.log(found.distance[measured] ** 2 + 1e-4)  # distances to the transmitters that were not left out
+    corrected_hz = () if found.alone else np.unique(dataset.frequencies_hz[training_links(dataset)])
+    return confidence_of(known, found.scores[measured], dataset.tx_index[index], receiver.position, trained, corrected_hz)

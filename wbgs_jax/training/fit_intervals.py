@@ -5,6 +5,8 @@ regression. Of several nested sets of features, the largest is chosen that lower
 standard error; small validation parts support only few features.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +26,7 @@ from wbgs_jax.inference.intervals import (
     PowerConfidence,
     features,
     power_features,
+    scaled_features,
 )
 from wbgs_jax.inference.kriging import Neighbours, correct
 from wbgs_jax.inference.predictor import as_observed, observe_links
@@ -76,7 +79,8 @@ def _of_spectra(
     known = np.asarray(_features(jnp.asarray(pas), query, receivers, trained, power), np.float64)
     alike = ssim(as_observed(field, params, pas), np.asarray(dataset.pas(index)))
     places = dataset.receivers.position if dataset.n_receivers > 1 else dataset.receiver().position
-    return confidence_of(known, alike, dataset.tx_index[index], places, trained)
+    corrected_hz = () if neighbours is None else np.unique(neighbours.frequency_hz)
+    return confidence_of(known, alike, dataset.tx_index[index], places, trained, corrected_hz)
 
 
 def confidence_of(
@@ -85,6 +89,7 @@ def confidence_of(
     tx_index: Int[np.ndarray, " n"],
     rx_position: Float[Array, "*r 3"],
     tx_position: Float[Array, "m 3"],
+    corrected_hz: Sequence[float] | Float[np.ndarray, " f"] = (),
 ) -> Confidence:
     """Returns prediction intervals of the SSIM, fitted to the features and scores of N predictions.
 
@@ -94,10 +99,11 @@ def confidence_of(
         tx_index: their transmitters.
         rx_position: positions of the receivers, metres.
         tx_position: positions of the trained transmitters, metres.
+        corrected_hz: frequencies at which measured spectra correct the predictions; none if they do not.
     """
-    *learned, rest = fit(known, np.log(1 + MARGIN - np.minimum(scores, 1)), tx_index, SETS)
+    *learned, rest = fit(known, np.log(1 + MARGIN - np.clip(scores, 0, 1)), tx_index, SETS)
     quantiles, level = interval(rest, tx_index)
-    arrays = *learned, quantiles, np.exp(rest).mean(), level
+    arrays = *learned, quantiles, np.exp(rest).mean(), level, np.asarray(corrected_hz)
     return Confidence(rx_position, tx_position, *(jnp.asarray(array, jnp.float32) for array in arrays))
 
 
@@ -135,8 +141,12 @@ def fit(
         tx_index: their transmitters.
         sets: numbers of features that are tried.
     """
-    mean, scale = known.mean(0), known.std(0) + 1e-6
-    scaled = (known - mean) / scale
+    mean, spread = known.mean(0), known.std(0)
+    # Of a feature that does not vary, such as the distance to the next transmitter of a grid, only rounding would be scaled: an
+    # infinite scale leaves it out.
+    least = 0.01  # natural logarithms, octaves or decibels
+    scale = np.where(spread > least, spread, np.inf)
+    scaled = np.asarray(scaled_features(known, mean, scale))
     enough = 5  # minimum number of transmitters per feature; with fewer the regression overfits
     sets = tuple(size for size in sets if enough * size <= len(np.unique(tx_index)))
     rests = {size: left_out(scaled[:, :size], error, tx_index) for size in sets}

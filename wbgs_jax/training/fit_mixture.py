@@ -237,10 +237,11 @@ def _kriged(
             tried = dataclasses.replace(local, length=jnp.float32(length), nugget=jnp.float32(nugget))
             spectra, _ = predict_members(tried, dataset, known, index, kept, ("kriging",))
             scores[length, nugget] = np.asarray(ssim_of(moments_of(spectra, truth), jnp.ones((len(index), 1))))
-    best, error = standard_error(max(scores.values(), key=np.mean), dataset.tx_index[index])
-    enough = [one for one, own in scores.items() if own.mean() >= best - error]
+    means = {one: standard_error(own, dataset.tx_index[index]) for one, own in scores.items()}
+    best, error = max(means.values())
+    enough = [one for one, (mean, _) in means.items() if mean >= best - error]
     length = max(length for length, _ in enough)
-    nugget = max((nugget for own, nugget in enough if own == length), key=lambda one: float(scores[length, one].mean()))
+    nugget = max((nugget for own, nugget in enough if own == length), key=lambda one: means[length, one][0])
     return dataclasses.replace(mixture, length=jnp.float32(length), nugget=jnp.float32(nugget))
 
 

@@ -229,13 +229,13 @@ def strata_of(evidence: Evidence) -> tuple[Int[np.ndarray, "new most"], Int[np.n
 
 
 def power_change_db(evidence: Evidence) -> float:
-    """Returns the mean change of the received power of new transmitters relative to the old ones next to them, dB."""
+    """Returns the median change of the received power of new transmitters relative to the old ones next to them, dB."""
     strata, sizes = strata_of(evidence)
     if evidence.power_db is None or not (sizes > 1).any():
         return 0.0
     own = evidence.power_db[strata][sizes > 1]
     others = (own.sum(1) - own[:, 0] * (own.shape[1] - sizes[sizes > 1] + 1)) / (sizes[sizes > 1] - 1)
-    return float(np.mean(own[:, 0] - others))
+    return float(np.median(own[:, 0] - others))
 
 
 def limit_of(evidence: Evidence, level: float, rng: np.random.Generator) -> float:
@@ -259,9 +259,11 @@ def _upper_share(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
 
 
 def _power_error_db(problem: CalibrationProblem, params: WaveParams) -> Float[np.ndarray, " n"] | None:
-    """Returns measured minus predicted received powers; None for data without powers."""
+    """Returns measured minus predicted received powers, limited, since one of both may be silence; None for data without
+    powers."""
     measured = power_of({name: values[problem.spectra] for name, values in problem.data.observations.items()})
-    return None if measured is None else np.asarray(measured) - predicted(problem, params, "power_db")
+    most = 30.0  # dB, of a link that is blocked
+    return None if measured is None else np.clip(np.asarray(measured) - predicted(problem, params, "power_db"), -most, most)
 
 
 @dataclass(frozen=True)
@@ -333,9 +335,11 @@ def find_changes(
     for _ in range(MOST_CHANGES):
         objects = objects_of(now.field)
         here = dataclasses.replace(problem, field=now.field, prepared=now.prepared)
+        if not len(objects):
+            break
         score, *without = _without_each(here, now.params, objects, NOTICED)
         gains = by_object(score, np.array(without), problem.tx_index())
-        if not len(objects) or gains.max() <= 0:
+        if gains.max() <= 0:
             break
         say(f"objects that may have changed: {len(objects)} compared")
         tried = [(one, *_anywhere(here, now, objects[one], RINGS_M[0])) for one in np.argsort(-gains)[:LIKELY].tolist()]
