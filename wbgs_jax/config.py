@@ -181,7 +181,7 @@ class Settings:
 
 
 PRESETS: Mapping[str, Settings] = {
-    # Under a minute on two cores: shows that everything runs, not that the result is good.
+    # Two minutes on two cores: shows that everything runs, not that the result is good.
     "smoke": Settings(
         optim=OptimConfig(steps=200, batch=4),
         loop=LoopConfig(epoch_steps=20, evaluate_every=100, evaluate_spectra=20, checkpoint_every=100),

@@ -97,6 +97,7 @@ ASK = ["--tx", INSIDE[0], "--ghz", "28"]
         ([*ASK, "--rx", "1,2,1,0,0,0,0", "--out", "OUT/a.npz"], ["quaternion"]),
         ([*ASK, "--rx", "1,1,1", "--out", "OUT/a.npz"], ["the wideband field predicts only the receivers", "wave or hybrid"]),
         (["--export", "RUN/config.json/a.zip"], ["cannot write"]),
+        (["--export", "OUT/a.zip", "--rx", "1,1,1"], ["first receiver", "without --rx"]),
     ],
 )
 def test_what_cannot_be_asked(run, tmp_path, arguments, words):
@@ -198,7 +199,7 @@ def test_what_a_field_gives_is_what_can_be_asked_for(tmp_path):
 def intervals():
     """Of spectra and of powers: the same for every query."""
     k, numbers = SETS[-1], (jnp.log(4.0), jnp.asarray(2.0), jnp.asarray(0.9))
-    of_spectra = (np.zeros(3), np.eye(3), np.zeros(k), np.ones(k), np.full(k + 1, -0.1), (-1, 1), 1.2, 0.9)
+    of_spectra = (np.zeros(3), np.eye(3), np.zeros(k), np.ones(k), np.full(k + 1, -0.1), (-1, 1), 1.2, 0.9, ())
     of_powers = jnp.zeros((1, 3)), jnp.zeros(4), jnp.ones(4), jnp.zeros(5)
     return Confidence(*(jnp.asarray(part, jnp.float32) for part in of_spectra)), PowerConfidence(*of_powers, *numbers)
 

@@ -110,6 +110,8 @@ def check(command: Command) -> None:
         raise UserError("nothing to do; give --tx x,y,z --ghz 28 --out spectra.npz, or --export field.zip")
     if (queried or writes) and not (places and bands and writes):
         raise UserError("predictions need all of --tx x,y,z, --ghz 28 and --out spectra.npz (or --picture spectra.png)")
+    if command.export and command.rx:
+        raise UserError("an exported field answers for the first receiver of the data; give --export without --rx")
     for several in (places, bands):
         if len(several) > 1:
             raise UserError(f"--{several[0]} and --{several[1]} exclude each other; give one of them")
