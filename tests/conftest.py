@@ -26,7 +26,7 @@ import jax
 import numpy as np
 import pytest
 
-MOST_MAPS = 25_000
+MOST_MAPS, MOST_BYTES = 25_000, 3e9
 SEED_VARIABLE, DATA_VARIABLE = "WBGS_TEST_SEED", "WBGS_SHARED"
 USUAL_SEED, FRESH = "2505", "fresh"
 """The seed where the environment names none, and what it says to have another one drawn."""
@@ -77,12 +77,18 @@ def pytest_terminal_summary(terminalreporter: "pytest.TerminalReporter", config:
 @pytest.fixture(autouse=True, scope="module")
 def few_programs_in_memory() -> Iterator[None]:
     """Forgets compiled programs when there are many: each takes memory maps, of which Linux gives a process 65,530, and where
-    they end XLA ends the process."""
+    they end XLA ends the process. Two workers that never forgot would take most of the memory of a laptop."""
     yield
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
+    process = Path("/proc/self")
+    if not process.exists():
+        return
+    maps, pages = (process / "maps").read_bytes().count(b"\n"), int((process / "statm").read_text().split()[1])
+    if maps > MOST_MAPS or pages * os.sysconf("SC_PAGE_SIZE") > MOST_BYTES:
         jax.clear_caches()
         gc.collect()
+        from wbgs_jax._util.compilation import give_back
+
+        give_back()
 
 
 @pytest.fixture
