@@ -151,6 +151,16 @@ def _fault_of_snapshots(values: np.ndarray) -> str:
     return "" if finite.any() else "only NaN"
 
 
+def _fault_of_powers(values: np.ndarray) -> str:
+    known = values[~np.isnan(values)]
+    if not known.size or np.isinf(known).any():
+        return "infinity, or only NaN"
+    highest_db = 30  # more than antenna gains reach close to a transmitter: a path loss, which is positive
+    if known.min() >= 0 or known.max() > highest_db:
+        return f"{known.max():g}, as path losses and linear powers do (give 20 log10|h| in dB, which is negative)"
+    return ""
+
+
 register_kind(
     Kind("pas", "spectra", np.uint8, PAS_SHAPE, to_spectra=_spectra_of_images)  # 255 times a spectrum whose maximum is 1
 )
@@ -175,7 +185,7 @@ register_kind(
         (),
         to_power=lambda values: values,
         measured=lambda values: values > NO_PATH_DB,  # False for NaN
-        fault=lambda values: "infinity, or only NaN" if np.isinf(values).any() or np.isnan(values).all() else "",
+        fault=_fault_of_powers,
         silence=NO_PATH_DB,
     )
 )

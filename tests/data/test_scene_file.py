@@ -236,6 +236,9 @@ def test_a_scene_that_is_none_is_not_written(tmp_path, scene, key, value, messag
         ("pas", np.ones((4, 2, 3, 90, 360), np.uint8), "element_positions has shape"),
         ("power_db", np.full((4, 1, 3), -np.inf, np.float32), "power_db contains infinity"),
         ("power_db", np.full((4, 1, 3), np.nan, np.float32), "or only NaN"),
+        ("power_db", np.full((4, 1, 3), 110, np.float32), r"power_db contains 110, as path losses .* \(give 20 log10"),
+        ("power_db", np.full((4, 1, 3), 1e-8, np.float32), "power_db contains 1e-08, as .* linear powers"),
+        ("power_db", np.full((4, 1, 3), [-60, -60, 31], np.float32), "power_db contains 31"),
         ("power_db", np.zeros((4, 0, 3), np.float32), "element_positions has shape"),
     ],
 )
