@@ -151,6 +151,10 @@ def _fault_of_snapshots(values: np.ndarray) -> str:
     return "" if finite.any() else "only NaN"
 
 
+def _fault_of_images(values: np.ndarray) -> str:
+    return "spectra of at most 1 (multiply them by 255)" if values.max(initial=0) == 1 else ""
+
+
 def _fault_of_powers(values: np.ndarray) -> str:
     known = values[~np.isnan(values)]
     if not known.size or np.isinf(known).any():
@@ -162,7 +166,8 @@ def _fault_of_powers(values: np.ndarray) -> str:
 
 
 register_kind(
-    Kind("pas", "spectra", np.uint8, PAS_SHAPE, to_spectra=_spectra_of_images)  # 255 times a spectrum whose maximum is 1
+    # 255 times a spectrum whose maximum is 1
+    Kind("pas", "spectra", np.uint8, PAS_SHAPE, to_spectra=_spectra_of_images, fault=_fault_of_images)
 )
 register_kind(
     Kind(

@@ -40,6 +40,7 @@ from wbgs_jax.data.load import materials_of, scene_dataset
 from wbgs_jax.data.scene_file import Room, SceneFile, load_room
 from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters, tx_disjoint_split
 from wbgs_jax.mesh.ply import read_ply, write_ply
+from wbgs_jax.observation_kinds import KINDS
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.types import (
     LARGEST_COORDINATE_M,
@@ -257,7 +258,10 @@ def _read_images(folder: Path) -> UInt8[np.ndarray, "n 90 360"]:
     for expected, (number, path) in enumerate(numbered, 1):
         if number != expected:
             raise UserError(f"{path} is in the place of image {expected:05d}; number images from 1, without gaps or duplicates")
-    return np.stack([_read_image(path) for _, path in numbered])
+    images = np.stack([_read_image(path) for _, path in numbered])
+    if fault := KINDS["pas"].fault(images):
+        raise UserError(f"{folder} contains {fault}; write its images again")
+    return images
 
 
 def _read_image(path: Path) -> UInt8[np.ndarray, "90 360"]:

@@ -90,7 +90,11 @@ def check_mesh(arrays: dict[str, np.ndarray], where: str) -> dict[str, np.ndarra
 
 def _cast(arrays: dict[str, np.ndarray], specs: dict[str, Spec]) -> dict[str, np.ndarray]:
     with np.errstate(over="ignore", invalid="ignore"):  # values that become infinite are detected afterwards
-        return {key: arrays[key].astype(dtype, copy=False) for key, (dtype, _) in specs.items()}
+        cast = {key: arrays[key].astype(dtype, copy=False) for key, (dtype, _) in specs.items()}
+    for key, values in cast.items():
+        kept = values.dtype.kind not in "iu" or np.array_equal(values, arrays[key])
+        _demand(kept, f"{key} contains numbers beyond the range of {values.dtype}")
+    return cast
 
 
 class _Wrong(Exception):
