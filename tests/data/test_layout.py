@@ -222,6 +222,11 @@ def image(name, size, mode="L"):
     return lambda folder: Image.new(mode, size).save(folder / name)
 
 
+def images_of_ones(folder):
+    for path in (folder / "spectrum").iterdir():
+        Image.new("L", (360, 90), 1).save(path)
+
+
 def empty(folder):
     shutil.rmtree(folder)
     folder.mkdir()
@@ -247,6 +252,7 @@ def no_images(folder):
         (image("spectrum/00003.png", (90, 360)), "00003.png", "360 x 90"),
         (image("spectrum/00003.png", (360, 90), "RGB"), "00003.png", "mode RGB"),
         (image("spectrum/00003.png", (360, 90), "I;16"), "00003.png", "mode I;16"),
+        (images_of_ones, "spectrum", "spectra of at most 1 (multiply them by 255)"),
         (image("spectrum/mean.png", (360, 90)), "spectrum", "'mean' is not an image number"),
         (image("spectrum/3.png", (360, 90)), "spectrum", "is in the place of image 00004"),
         (image("spectrum/00000.png", (360, 90)), "00000.png", "number images from 1"),

@@ -121,7 +121,8 @@ def _sizes(arrays: dict[str, np.ndarray], specs: dict[str, Spec]) -> dict[str, i
     sizes: dict[str, int] = {}
     for key, (dtype, axes) in specs.items():
         value = arrays[key]
-        castable = np.can_cast(value.dtype, dtype, "same_kind")
+        phased = np.iscomplexobj(value) or not issubclass(dtype, np.complexfloating)  # real numbers would have phases of 0
+        castable = phased and np.can_cast(value.dtype, dtype, "same_kind")
         _demand(value.ndim == len(axes) and castable, f"{key} must be a {len(axes)}-D {dtype.__name__} array")
         lengths = list(zip(axes, value.shape, strict=True))
         expected = tuple(sizes.get(axis, n) if isinstance(axis, str) else axis for axis, n in lengths)
