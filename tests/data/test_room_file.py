@@ -1,5 +1,6 @@
 """A room by itself: written and read, beside spectra and beside snapshots."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -29,6 +30,16 @@ def test_a_room_is_what_was_written(tmp_path, room):
         np.testing.assert_array_equal(getattr(again, name), getattr(room, name))
         assert getattr(again, name).dtype == getattr(room, name).dtype
     assert again.parts == PARTS
+
+
+def test_a_room_that_cannot_be_read_is_not_written(tmp_path, room):
+    with pytest.raises(UserError, match=r"a\.npz: vertices contains .*; positions are in metres"):
+        save_room(tmp_path / "a.npz", dataclasses.replace(room, vertices=1e4 * room.vertices))
+    with pytest.raises(UserError, match=r"a\.npz: meta contains what JSON cannot represent"):
+        save_room(tmp_path / "a.npz", dataclasses.replace(room, parts=[{"name": tmp_path}]))
+    assert not list(tmp_path.iterdir())
+    save_room(tmp_path / "a.npz", dataclasses.replace(room, parts=[{"thickness": np.float64(0.5)}]))
+    assert load_room(tmp_path / "a.npz").parts == [{"thickness": 0.5}]
 
 
 def test_beside_snapshots_objects_keep_their_materials(tmp_path, room, rng):

@@ -87,6 +87,16 @@ def test_equal_scenes_give_equal_bytes(tmp_path, scene):
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes() == (tmp_path / "c.npz").read_bytes()
 
 
+def test_metadata_may_hold_numbers_of_numpy(tmp_path, scene):
+    meta = {"seed": np.int64(7), "gain": np.float32(0.5), "checks": np.array([1, 2])}
+    save_scene(tmp_path / "s.npz", dataclasses.replace(scene, meta=meta))
+    assert {"seed": 7, "gain": 0.5, "checks": [1, 2]}.items() <= load_scene(tmp_path / "s.npz").meta.items()
+    for other in (1j, np.complex64(1), tmp_path):
+        with pytest.raises(UserError, match=r"^.*t\.npz: meta contains what JSON cannot represent \(a \w+\); give texts"):
+            save_scene(tmp_path / "t.npz", dataclasses.replace(scene, meta={"a": other}))
+    assert not (tmp_path / "t.npz").exists()
+
+
 def test_a_scene_needs_no_mesh(tmp_path, scene):
     bare = dataclasses.replace(
         scene, vertices=np.zeros((0, 3), np.float32), faces=np.zeros((0, 3), np.int32), face_part=np.zeros(0, np.int32)

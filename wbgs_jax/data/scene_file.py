@@ -236,7 +236,7 @@ def save_scene(path: Path | str, scene: SceneFile) -> None:
     """
     arrays = {key: getattr(scene, key) for key in (*ARRAYS, *TEXTS)} | scene.observations
     arrays = check_arrays({key: np.asarray(value) for key, value in arrays.items()}, str(path))
-    meta = json.dumps(scene.meta | {"format": FORMAT, "name": scene.name}, sort_keys=True)
+    meta = _to_json(scene.meta | {"format": FORMAT, "name": scene.name}, str(path))
     with atomic_write(path) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         for key, value in (arrays | {"meta": np.array(meta)}).items():
             # A fixed date: numpy.savez stores the time, so that equal scenes would have different checksums.
@@ -244,6 +244,20 @@ def save_scene(path: Path | str, scene: SceneFile) -> None:
             info.compress_type = zipfile.ZIP_DEFLATED
             with archive.open(info, "w") as member:
                 np.lib.format.write_array(member, np.asarray(value, order="C"), allow_pickle=False)
+
+
+def _to_json(meta: dict[str, Any], where: str) -> str:
+    """Returns metadata as JSON, in which numbers and arrays of NumPy are plain ones."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.generic | np.ndarray):
+            return value.tolist()
+        raise TypeError(f"a {type(value).__name__}")
+
+    try:
+        return json.dumps(meta, sort_keys=True, default=plain)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{where}: meta contains what JSON cannot represent ({error}); give texts, numbers and lists") from None
 
 
 def load_scene(path: Path | str) -> SceneFile:
@@ -306,10 +320,19 @@ class Room:
 
 
 def save_room(path: Path | str, room: Room) -> None:
-    """Writes a room file."""
-    meta = json.dumps({"format": "room 1", "parts": room.parts}, sort_keys=True)
+    """Checks and writes a room file.
+
+    Args:
+        path: of the file (.npz).
+        room: its content.
+
+    Raises:
+        UserError: the room is invalid, or the file cannot be written.
+    """
+    arrays = check_mesh({name: np.asarray(getattr(room, name)) for name in MESH}, str(path))
+    meta = _to_json({"format": "room 1", "parts": room.parts}, str(path))
     with atomic_write(path) as stream:
-        np.savez_compressed(stream, **{name: getattr(room, name) for name in MESH}, meta=np.array(meta))
+        np.savez_compressed(stream, **arrays, meta=np.array(meta))
 
 
 def load_room(path: Path | str) -> Room:
