@@ -222,6 +222,14 @@ def image(name, size, mode="L"):
     return lambda folder: Image.new(mode, size).save(folder / name)
 
 
+def scale_mesh(factor):
+    def spoil(folder):
+        vertices, faces = read_ply(folder / "point_cloud.ply")
+        write_ply(folder / "point_cloud.ply", factor * vertices, faces)
+
+    return spoil
+
+
 def images_of_ones(folder):
     for path in (folder / "spectrum").iterdir():
         Image.new("L", (360, 90), 1).save(path)
@@ -301,6 +309,8 @@ def no_images(folder):
         (lambda f: (write("validation_index.txt", "3")(f), remove("test_index.txt")(f)), "test_index.txt", "No such file"),
         (truncate("point_cloud.ply"), "point_cloud.ply", "truncated"),
         (write("point_cloud.ply", ""), "point_cloud.ply", "not a PLY"),
+        (scale_mesh(1000), "point_cloud.ply", "vertices contains 10000; positions are in metres"),
+        (scale_mesh(1e-3), "den", "no antenna is near the surfaces"),
     ],
 )
 def test_bad_input(folder, spoil, file, trouble):

@@ -105,6 +105,15 @@ def test_a_scene_needs_no_mesh(tmp_path, scene):
     assert load_scene(tmp_path / "s.npz").faces.shape == (0, 3)
 
 
+def test_surfaces_without_an_antenna_near_them_are_refused(scene):
+    """One antenna suffices, at most the longest side of their box away."""
+    surfaces = {"faces": np.array([[0, 1, 2]], np.int32), "face_part": np.zeros(1, np.int32)}
+    corner = dataclasses.replace(scene, vertices=np.float32(100 + 2 * np.eye(3)), **surfaces)
+    assert len(scene_dataset(dataclasses.replace(corner, rx_position=np.full((1, 3), 98.1)))) == 15
+    with pytest.raises(UserError, match=r"^den: no antenna is near the surfaces, .*; give both in metres, in one frame$"):
+        scene_dataset(dataclasses.replace(corner, rx_position=np.full((1, 3), 97.9)))
+
+
 def test_links_are_transmitter_major(scene):
     dataset = scene_dataset(scene)
     assert len(dataset) == 15 and dataset.n_receivers == 1

@@ -36,8 +36,8 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_text, read_yaml, safe_name
 from wbgs_jax.data.conventions import CONVENTIONS, ConventionName, array_of, find_convention, to_pas
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.load import materials_of, scene_dataset
-from wbgs_jax.data.scene_file import Room, SceneFile, load_room
+from wbgs_jax.data.load import check_surroundings, materials_of, scene_dataset
+from wbgs_jax.data.scene_file import Room, SceneFile, check_mesh, load_room
 from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters, tx_disjoint_split
 from wbgs_jax.mesh.ply import read_ply, write_ply
 from wbgs_jax.observation_kinds import KINDS
@@ -169,7 +169,7 @@ def load_layout(
         split = {"train": train, "validation": train[:0], "test": test}
     named = _agreed(convention, gateway.convention, folder) or _inferred(folder, images, gateway, positions, tx_index, split)
     receiver = make_receiver(gateway.position, gateway.orientation, array_of(named))
-    return Dataset(
+    dataset = Dataset(
         name=gateway.name or safe_name(folder.resolve().name),
         receivers=stack_receivers([receiver]),
         tx_positions=positions,
@@ -188,6 +188,7 @@ def load_layout(
         materials=materials_of(room, str(folder / ROOM)),
         convention=named,
     )
+    return check_surroundings(dataset)
 
 
 def export_layout(scene: SceneFile, folder: Path | str) -> None:
@@ -248,7 +249,8 @@ def _read_room(folder: Path) -> Room:
             raise UserError(f"{folder} has both {MESH} and {ROOM}; keep only one of them")
         return load_room(room)
     vertices, faces = read_ply(mesh) if mesh.exists() else (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
-    return Room(mesh_to_world(vertices), faces, np.zeros(len(faces), np.int32))
+    arrays = {"vertices": mesh_to_world(vertices), "faces": faces, "face_part": np.zeros(len(faces), np.int32)}
+    return Room(**check_mesh(arrays, str(mesh)))
 
 
 def _read_images(folder: Path) -> UInt8[np.ndarray, "n 90 360"]:

@@ -207,7 +207,7 @@ def scene_dataset(scene: SceneFile) -> Dataset:
     tx_index = group_transmitters(scene.tx_positions[tx])
     parts = {name: np.flatnonzero(split == code) for name, code in PARTS.items()}
     note_shared_transmitters(scene.name, tx_index, parts)
-    return Dataset(
+    dataset = Dataset(
         name=scene.name,
         receivers=stack_receivers(_receivers(scene)),
         tx_positions=scene.tx_positions[tx],
@@ -223,6 +223,26 @@ def scene_dataset(scene: SceneFile) -> Dataset:
         face_part=scene.face_part,
         materials=materials_of(Room(scene.vertices, scene.faces, scene.face_part, scene.meta.get("parts", [])), scene.name),
     )
+    return check_surroundings(dataset)
+
+
+def check_surroundings(dataset: Dataset) -> Dataset:
+    """Returns the dataset, after a comparison of its surfaces with its antennas.
+
+    Raises:
+        UserError: every antenna is farther from the box of the surfaces than its longest side, as with another unit or frame.
+    """
+    if len(dataset.faces):
+        used = dataset.vertices[dataset.faces].reshape(-1, 3).astype(np.float64)
+        low, high = used.min(0), used.max(0)
+        antennas = np.concatenate([dataset.tx_positions, np.asarray(dataset.receivers.position)])
+        distance = np.maximum(low - antennas, antennas - high).max(-1)
+        if distance.min() > (high - low).max():
+            raise UserError(
+                f"{dataset.name}: no antenna is near the surfaces, which lie between {np.round(low, 2).tolist()} and "
+                f"{np.round(high, 2).tolist()}; give both in metres, in one frame"
+            )
+    return dataset
 
 
 def released_scenes() -> dict[str, Path]:

@@ -329,7 +329,7 @@ def save_room(path: Path | str, room: Room) -> None:
     Raises:
         UserError: the room is invalid, or the file cannot be written.
     """
-    arrays = check_mesh({name: np.asarray(getattr(room, name)) for name in MESH}, str(path))
+    arrays: dict[str, Any] = check_mesh({name: np.asarray(getattr(room, name)) for name in MESH}, str(path))
     meta = _to_json({"format": "room 1", "parts": room.parts}, str(path))
     with atomic_write(path) as stream:
         np.savez_compressed(stream, **arrays, meta=np.array(meta))
