@@ -61,17 +61,33 @@ def test_links_of_no_part_stay_in_none(parts):
     assert len(joined.train) + len(joined.validation) + len(joined.test) == len(joined) - 2
 
 
+def thicker(dataset):
+    return dataclasses.replace(dataset.materials, thickness=2 * dataset.materials.thickness)
+
+
 @pytest.mark.parametrize(
     "change, said",
     [
         (lambda one: tiny_dataset(6, kind="pas"), "contains snapshots, the other spectra"),
         (lambda one: tiny_dataset(6, unit="metres"), "their arrays differ"),
         (lambda one: dataclasses.replace(one, vertices=one.vertices + 1), "their surfaces differ"),
+        (lambda one: dataclasses.replace(one, materials=thicker(one)), "materials or thicknesses of their surfaces differ"),
+        (lambda one: dataclasses.replace(one, convention="elevation"), "have the conventions zenith and elevation"),
     ],
 )
 def test_what_does_not_belong_together_is_refused_by_name(parts, change, said):
-    with pytest.raises(UserError, match=said):
-        join([parts[1], change(parts[2])])
+    first = dataclasses.replace(parts[1], convention="zenith")
+    for others in ([], [dataclasses.replace(parts[2], materials=None, convention=None)]):
+        with pytest.raises(UserError, match=said):
+            join([first, *others, change(parts[2])])
+
+
+def test_materials_and_convention_of_one_hold_for_all(parts):
+    _, first, second = parts
+    unnamed = dataclasses.replace(first, materials=None)
+    joined = join([unnamed, dataclasses.replace(second, convention="elevation")])
+    assert joined.materials is second.materials and joined.convention == "elevation"
+    assert join([unnamed, dataclasses.replace(second, materials=None)]).materials is None
 
 
 def test_names_with_commas_between_them_are_joined(tmp_path):

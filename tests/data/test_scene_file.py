@@ -105,6 +105,12 @@ def test_a_scene_needs_no_mesh(tmp_path, scene):
     assert load_scene(tmp_path / "s.npz").faces.shape == (0, 3)
 
 
+def test_a_thickness_in_millimetres_is_refused(scene):
+    parts = [{"name": "floor"}, {"name": "wall", "material": "brick", "thickness": 200}]
+    with pytest.raises(UserError, match=r"^part 1 of den must be .* a thickness in metres, 0 to 2; correct it$"):
+        scene_dataset(dataclasses.replace(scene, meta={"parts": parts}))
+
+
 def test_surfaces_without_an_antenna_near_them_are_refused(scene):
     """One antenna suffices, at most the longest side of their box away."""
     surfaces = {"faces": np.array([[0, 1, 2]], np.int32), "face_part": np.zeros(1, np.int32)}

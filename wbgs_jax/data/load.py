@@ -3,6 +3,8 @@ with different receivers in one scene as a single dataset. For files and folders
 convert them.
 """
 
+import dataclasses
+import itertools
 import os
 import warnings
 from collections.abc import Sequence
@@ -20,7 +22,7 @@ from wbgs_jax.data.dataset import Dataset, Materials
 from wbgs_jax.data.scene_file import TEST, TRAIN, VALIDATION, Room, SceneFile, load_scene
 from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters
 from wbgs_jax.observation_kinds import only_kind
-from wbgs_jax.types import LARGEST_COORDINATE_M, Receiver, make_receiver, stack_receivers
+from wbgs_jax.types import Receiver, make_receiver, stack_receivers
 
 
 def join(datasets: Sequence[Dataset]) -> Dataset:
@@ -31,11 +33,11 @@ def join(datasets: Sequence[Dataset]) -> Dataset:
     would reveal it. Links that are in no part of their dataset are in none here.
 
     Raises:
-        UserError: the datasets are from different scenes, or have different kinds of observations or arrays.
+        UserError: the datasets are from different scenes, or have different kinds of observations, arrays or conventions.
     """
-    first, *others = datasets
-    for other in others:
-        _check_compatible(first, other)
+    first = datasets[0]
+    for one, other in itertools.combinations(datasets, 2):
+        _check_compatible(one, other)
     tx_positions = np.concatenate([one.tx_positions for one in datasets])
     tx_index = group_transmitters(tx_positions)
     before = np.cumsum([0, *(len(one) for one in datasets)])
@@ -60,7 +62,8 @@ def join(datasets: Sequence[Dataset]) -> Dataset:
         vertices=first.vertices,
         faces=first.faces,
         face_part=first.face_part,
-        materials=first.materials,
+        materials=next((one.materials for one in datasets if one.materials is not None), None),
+        convention=next((one.convention for one in datasets if one.convention is not None), None),
     )
 
 
@@ -74,6 +77,19 @@ def _check_compatible(first: Dataset, other: Dataset) -> None:
     surfaces = ("vertices", "faces", "face_part")
     if not all(np.array_equal(getattr(first, name), getattr(other, name)) for name in surfaces):
         raise UserError(f"{where}: their surfaces differ; give datasets of one scene")
+    if _differ(first.materials, other.materials):
+        raise UserError(f"{where}: the materials or thicknesses of their surfaces differ; correct the parts of one of them")
+    if len({first.convention, other.convention} - {None}) > 1:
+        raise UserError(
+            f"{where}: their images have the conventions {first.convention} and {other.convention}; give folders of one"
+        )
+
+
+def _differ(first: Materials | None, other: Materials | None) -> bool:
+    """Returns whether two assignments of materials are known and different."""
+    if first is None or other is None:
+        return False
+    return not all(map(np.array_equal, dataclasses.astuple(first), dataclasses.astuple(other)))
 
 
 def _numbered_on(datasets: Sequence[Dataset], receivers: Int[np.ndarray, " sets"]) -> Int[np.ndarray, " n"]:
@@ -258,9 +274,11 @@ def _label(part: Any, number: int, name: str) -> tuple[str, float]:
         material = str(part.get("material", part.get("name", number)))
     except (AttributeError, TypeError, ValueError):
         thickness, material = np.nan, ""
-    if not 0 <= thickness <= LARGEST_COORDINATE_M:
+    max_thickness = 2.0  # metres: a larger thickness was probably given in millimetres
+    if not 0 <= thickness <= max_thickness:
         raise UserError(
-            f'part {number} of {name} must be {{"name", "material", "thickness"}} with a thickness in metres, 0 or more'
+            f'part {number} of {name} must be {{"name", "material", "thickness"}} with a thickness in metres, 0 to '
+            f"{max_thickness:g}; correct it"
         )
     return material, thickness
 
