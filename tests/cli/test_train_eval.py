@@ -220,6 +220,8 @@ def test_resuming_and_what_stands_in_its_way(run, scene):
         (["--scene", "SCENE", "--preset", "smoke", "--wideband.radiance-widths"], ["radiance-widths", "at least 1"]),
         (["--data", "LAYOUT", "--frequency-ghz", "5"], ["freq.txt"]),
         (["--scene", "SCENE", "--frequency-ghz", "5"], ["--frequency-ghz is for folders"]),
+        (["--scene", "SCENE", "--seed", "-1"], ["--seed is -1", "from 0 to"]),
+        (["--scene", "SCENE", "--seed", str(2**32)], ["--seed is 4294967296", "from 0 to"]),
         (["--scene", "SCENE", "--validation", "1"], ["--validation", "fraction"]),
         (["--scene", "SCENE", "--validation", "-0.1"], ["--validation", "fraction"]),
         (["--scene", "SCENE", "--receiver", "1"], ["receivers 0 to 0"]),

@@ -143,6 +143,9 @@ def run_config(command: Command, settings: Settings) -> RunConfig:
         raise UserError(
             f"--validation is {command.validation}; give a fraction of the training transmitters, at least 0 and below 1"
         )
+    largest_seed = 2**32 - 1  # the keys of JAX have 32 bits
+    if not 0 <= command.seed <= largest_seed:
+        raise UserError(f"--seed is {command.seed}; give a whole number from 0 to {largest_seed}")
     if len(command.test_box) not in (0, 6):
         raise UserError(
             f"--test-box has {len(command.test_box)} numbers; give six: x y z of the lowest corner, then of the highest"
