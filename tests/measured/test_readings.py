@@ -10,6 +10,8 @@ from builders.flats import HEIGHT, RECEIVERS, folder, places, powers, write_tabl
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.rssi_folder import Readings, attribution, cell_means, load_readings
 from wbgs_jax.data.tables import match_columns, not_received, tokens
+from wbgs_jax.power_map.model import MAX_PLACES
+from wbgs_jax.power_map.survey import load_survey
 
 
 def test_a_folder_of_tables(tmp_path, rng):
@@ -264,6 +266,18 @@ def test_degrees_are_no_metres(tmp_path, rng):
         (tmp_path / file).write_text("\n".join(",".join(row) for row in [header, *rows]))
     with pytest.raises(UserError, match="degrees of longitude and latitude; project them to metres"):
         load_readings(tmp_path, HEIGHT)
+
+
+def test_a_room_for_every_reading_is_refused(tmp_path, rng):
+    """Instead of averaging over ever larger cells."""
+    folder(tmp_path, rng, n=MAX_PLACES + 1)
+    path = tmp_path / "readings.csv"
+    header, *rows = path.read_text().splitlines()
+    room = header.split(",").index("room")
+    named = [",".join([*(cells := row.split(","))[:room], str(k), *cells[room + 1 :]]) for k, row in enumerate(rows)]
+    path.write_text("\n".join([header, *named]))
+    with pytest.raises(UserError, match=r"readings of 1501 rooms give at least 1501 cells, but .* at most 1500; name the room"):
+        load_survey(tmp_path)
 
 
 def test_floors_part_readings_as_rooms_do(tmp_path):

@@ -52,9 +52,15 @@ def load_survey(folder: Path, height_m: float = HEIGHT_M, cell_m: float = CELL_M
         floor_plan: the file of the walls; by default the one in the folder.
 
     Raises:
-        UserError: a file is missing or cannot be read.
+        UserError: a file is missing or cannot be read, or there are too many rooms.
     """
     readings = load_readings(folder, height_m)
+    largest_m = 1e5  # side of cells that hold everything but other rooms and other signs of coordinates
+    if (fewest := len(cell_means(readings, largest_m).places)) > MAX_PLACES:
+        raise UserError(
+            f"{folder}: readings of {len(set(readings.rooms))} rooms give at least {fewest} cells, but a map has at most "
+            f"{MAX_PLACES}; name the room, not the reading, in the columns of rooms and floors, or leave them out"
+        )
     cells = cell_means(readings, cell_m)
     while len(cells.places) > MAX_PLACES:
         cell_m *= 2
