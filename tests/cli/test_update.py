@@ -11,6 +11,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.commands.update import main
 from wbgs_jax.data.load import RELEASED
 from wbgs_jax.data.scene_file import SceneFile, load_scene, save_scene
+from wbgs_jax.inference.trained_field import RunConfig
 from wbgs_jax.training.update import check_new
 
 
@@ -63,6 +64,16 @@ def test_data_that_do_not_belong_to_the_run_are_refused(tmp_path, count, changes
     done = call(main, "--example", "--data", tmp_path / "new.npz", "--out", tmp_path / "out")
     assert_error_for_people(done, message)
     assert not (tmp_path / "out").exists()
+
+
+def test_new_links_are_read_with_the_options_of_the_run(tmp_path, monkeypatch):
+    def other_data(config, source):
+        raise UserError(f"{source} is read at {config.frequency_ghz} GHz; stop here")
+
+    new_links(tmp_path / "new.npz", 6)
+    monkeypatch.setattr(RunConfig, "other_data", other_data)
+    done = call(main, "--example", "--data", tmp_path / "new.npz", "--out", tmp_path / "out")
+    assert_error_for_people(done, "new.npz is read at None GHz")
 
 
 def test_a_field_without_a_mesh_has_nothing_that_could_have_changed():

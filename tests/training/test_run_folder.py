@@ -6,12 +6,14 @@ import json
 import jax
 import numpy as np
 import pytest
-from builders.synthetic import tiny_settings
+from builders.synthetic import tiny_scene, tiny_settings
 from builders.untrained import STEP, make_field, make_params, make_run
 
 import wbgs_jax
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.config import PRESETS, changed, from_sections, sections
+from wbgs_jax.data import save_scene
+from wbgs_jax.data.image_folder import export_layout
 from wbgs_jax.fields import field_names, get_field
 from wbgs_jax.training.run_folder import (
     RunConfig,
@@ -45,6 +47,22 @@ def test_what_is_not_a_default_comes_back_too(tmp_path):
     assert read_config(tmp_path / "run") == config
     assert isinstance(read_config(tmp_path / "run").train_ghz, tuple)
     assert isinstance(read_config(tmp_path / "run").settings.field.radiance_widths, tuple)
+
+
+def test_other_data_have_the_frequency_that_they_record(tmp_path):
+    """Without one, that of the run."""
+    folder = tmp_path / "box"
+    export_layout(tiny_scene(kind="pas"), folder)
+    config = dataclasses.replace(CONFIG, source=str(folder))
+    assert set(config.other_data(str(folder)).frequencies_hz) == {1e9, 10e9, 94e9}
+    (folder / "freq.txt").unlink()
+    assert set(config.other_data(str(folder)).frequencies_hz) == {2.4e9}
+    gateway = folder / "gateway_info.yml"
+    gateway.write_text(f"frequency: 5\n{gateway.read_text()}")
+    assert set(config.other_data(str(folder)).frequencies_hz) == {5e9}
+    assert set(config.dataset().frequencies_hz) == {2.4e9}, "as it was trained"
+    save_scene(tmp_path / "box.npz", tiny_scene())
+    assert set(config.other_data(str(tmp_path / "box.npz")).frequencies_hz) == {1e9, 10e9, 94e9}
 
 
 def edited(tmp_path, edit):

@@ -52,7 +52,6 @@ def check(command: Command) -> None:
 
 def update(command: Command) -> None:
     """Tests whether the room has changed, finds what has, and writes the updated run."""
-    from wbgs_jax.data.load import load_dataset
     from wbgs_jax.training.run_folder import open_run
     from wbgs_jax.training.update import check_new, lines_of, updated, write_run
 
@@ -60,7 +59,7 @@ def update(command: Command) -> None:
     begin = time.monotonic()
     trained = open_run(command.folder)
     old = trained.dataset()
-    new = check_new(load_dataset(str(command.data)), old)
+    new = check_new(trained.config.other_data(str(command.data)), old)
     found = updated(trained, old, new, command.false_alarms, say)
     for line in found.remarks:
         say(line)

@@ -97,6 +97,16 @@ def read_gateway(path: Path) -> Gateway:
     )
 
 
+def records_frequency(source: str | Path) -> bool:
+    """Returns whether data need no frequency from the caller: a folder that records its own, or a scene."""
+    folder = Path(source)
+    if not folder.is_dir() or (folder / FREQUENCIES).exists():
+        return True
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # `load_layout` repeats them
+        return (folder / GATEWAY).exists() and read_gateway(folder / GATEWAY).frequency_hz is not None
+
+
 def vector(value: Any, length: int, what: str) -> list[float]:
     """Returns `length` numbers.
 

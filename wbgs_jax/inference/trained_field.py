@@ -11,7 +11,8 @@ from wbgs_jax._util.public_names import warn_renamed
 from wbgs_jax.config import Settings
 from wbgs_jax.data.conventions import ConventionName
 from wbgs_jax.data.dataset import Dataset, check_data
-from wbgs_jax.data.load import load_dataset
+from wbgs_jax.data.image_folder import records_frequency
+from wbgs_jax.data.load import load_dataset, source_names
 from wbgs_jax.data.splits import (
     VALIDATION,
     fewer_transmitters,
@@ -54,14 +55,14 @@ class RunConfig:
     convention: ConventionName | None = None
     """Pixel order of a folder's images; None without a folder, or if not yet determined."""
 
-    def other_data(self, source: str, convention: ConventionName | None = None) -> Dataset:
-        """Returns other data by name, read with the options of the training data."""
-        frequency = None if self.frequency_ghz is None else self.frequency_ghz * 1e9
-        return load_dataset(source, frequency_hz=frequency, seed=self.seed, convention=convention)
+    def other_data(self, source: str) -> Dataset:
+        """Returns other data by name, read with the seed of the training data, and with their frequency if they record none."""
+        recorded = all(map(records_frequency, source_names(source)))
+        return load_dataset(source, frequency_hz=None if recorded else self._frequency_hz, seed=self.seed)
 
     def dataset(self) -> Dataset:
         """Returns the training data of the run."""
-        dataset = self.other_data(self.source, self.convention)
+        dataset = load_dataset(self.source, self._frequency_hz, self.seed, convention=self.convention)
         if self.receiver is not None:
             dataset = select_receivers(dataset, [self.receiver])
         if self.test_box:
@@ -71,6 +72,10 @@ class RunConfig:
         if self.train_tx:
             dataset = fewer_transmitters(dataset, self.train_tx, self.seed)
         return hold_out_validation(dataset, self.validation) if self.validation else dataset
+
+    @property
+    def _frequency_hz(self) -> float | None:
+        return None if self.frequency_ghz is None else self.frequency_ghz * 1e9
 
 
 @dataclass(frozen=True)
