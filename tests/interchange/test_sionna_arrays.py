@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders.drawn_paths import bounced_paths
 from scipy.spatial.transform import Rotation
 
 from wbgs_jax._util.errors import UserError
@@ -130,6 +131,15 @@ def test_the_other_side(rng):
     np.testing.assert_allclose(one.snapshots, two.snapshots)
     with pytest.raises(UserError, match=r"transmitters of street have 16 antennas; choose one: --tx-antenna 1 to 16"):
         scene_of_sionna(turned, "street")
+
+
+def test_vertices_of_the_other_side_are_in_the_other_order(rng):
+    """Also in the raw arrays of several bounces, whose lengths are compared with their vertices."""
+    paths = bounced_paths(rng)
+    turned = scene_of_sionna(paths.as_sionna(), "room", swap=True)
+    expected = scene_of_sionna(paths.reversed().as_sionna(), "room")
+    np.testing.assert_allclose(turned.snapshots, expected.snapshots)
+    np.testing.assert_allclose(turned.tx_positions, paths.targets)
 
 
 @pytest.mark.parametrize(

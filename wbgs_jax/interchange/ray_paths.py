@@ -67,9 +67,6 @@ class RayPaths:
         def swapped(values: np.ndarray, axis: int = 0) -> np.ndarray:
             return np.swapaxes(values, axis, axis + 1)
 
-        number = (self.interactions != NONE).sum(0)
-        place = np.arange(len(self.interactions))[:, None, None, None]
-        backwards = np.where(place < number, number - 1 - place, place)
         return RayPaths(
             a=swapped(self.a),
             tau=swapped(self.tau),
@@ -77,8 +74,8 @@ class RayPaths:
             phi_t=swapped(self.phi_r),
             theta_r=swapped(self.theta_t),
             phi_r=swapped(self.phi_t),
-            interactions=swapped(np.take_along_axis(self.interactions, backwards, 0), 1),
-            vertices=swapped(np.take_along_axis(self.vertices, backwards[..., None], 0), 1),
+            interactions=swapped(backwards(self.interactions, self.interactions), 1),
+            vertices=swapped(backwards(self.vertices, self.interactions), 1),
             valid=swapped(self.valid),
             sources=self.targets,
             targets=self.sources,
@@ -154,10 +151,19 @@ def check_arrays(arrays: Mapping[str, np.ndarray], what: str) -> None:
         raise UserError(f"a of {what} has shape {of_a}; expected receivers, transmitters and paths")
     for name, values in arrays.items():
         shape = values.shape[int(name in ("interactions", "vertices")) :][: -1 if name == "vertices" else None]
-        if name == "vertices" and (values.shape[-1:] != (3,) or len(values) != len(arrays.get("interactions", values))):
+        known = arrays["interactions"].shape if "interactions" in arrays else values.shape[:-1]
+        if name == "vertices" and values.shape != (*known, 3):
             shape = ()
         if (shape[::2] if len(shape) == ARRAYS else shape) != (of_a[::2] if len(of_a) == ARRAYS else of_a):
             raise UserError(f"{name} of {what} has shape {values.shape}, which does not fit a with {of_a}")
+
+
+def backwards(values: np.ndarray, interactions: Int[np.ndarray, "d ..."]) -> np.ndarray:
+    """Returns interactions, or their vertices, in the order from the receiver to the transmitter; padding stays at the end."""
+    number = (interactions != NONE).sum(0)
+    place = np.arange(len(interactions)).reshape(-1, *[1] * number.ndim)
+    order = np.where(place < number, number - 1 - place, place)
+    return np.take_along_axis(values, order.reshape(order.shape + (1,) * (values.ndim - order.ndim)), 0)
 
 
 def from_paths(arrivals: Any, tx_positions: Any, rx_position: Any, frequency_hz: float) -> RayPaths:

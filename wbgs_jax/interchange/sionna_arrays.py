@@ -21,6 +21,7 @@ from wbgs_jax.interchange.ray_paths import (
     ARRAYS,
     OF_PATHS,
     array_of,
+    backwards,
     carrier,
     check_arrays,
     check_paths,
@@ -297,6 +298,8 @@ def _swapped(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         if name in ("sources", "targets", "frequency_hz"):
             return values
         before = int(name in ("interactions", "vertices"))
+        if before and "interactions" in arrays:
+            values = backwards(values, arrays["interactions"])
         antennas = values.ndim - before - int(name == "vertices") == ARRAYS
         pairs = ((0, 2), (1, 3)) if antennas else ((0, 1),)
         for one, two in pairs:
