@@ -133,6 +133,26 @@ def test_the_other_side(rng):
         scene_of_sionna(turned, "street")
 
 
+def joined_receivers(*every):
+    """The arrays of several receivers of the same transmitters in one file."""
+    names = [name for name in every[0] if name not in ("sources", "frequency_hz")]
+    return every[0] | {name: np.concatenate([one[name] for one in every]) for name in names}
+
+
+@pytest.mark.parametrize("without", ["coefficients", "valid paths"])
+def test_a_receiver_without_paths_is_oriented_as_the_others(rng, without):
+    turn = Rotation.random(random_state=rng)
+    one = Traced(rng, turn=turn).arrays
+    silent = one | ({"a": 0 * one["a"]} if without == "coefficients" else {"tau": np.full_like(one["tau"], -1)})
+    scene = scene_of_sionna(joined_receivers(one, silent), "street")
+    np.testing.assert_allclose(scene.rx_orientation, scene_of_sionna(one, "street").rx_orientation[[0, 0]], atol=1e-6)
+    assert not scene.snapshots[:, 1].any() and scene.snapshots[:, 0].all()
+    turned = Traced(np.random.default_rng(1), turn=turn * Rotation.from_euler("z", 90, degrees=True)).arrays
+    turned |= {"sources": np.full((COUNT, 3), np.nan)}
+    with pytest.raises(UserError, match="receiver 2 of street has no path"):
+        scene_of_sionna(joined_receivers(turned, silent, one), "street")
+
+
 def test_vertices_of_the_other_side_are_in_the_other_order(rng):
     """Also in the raw arrays of several bounces, whose lengths are compared with their vertices."""
     paths = bounced_paths(rng)

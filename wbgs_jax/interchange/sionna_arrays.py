@@ -37,6 +37,8 @@ from wbgs_jax.types import Receiver
 
 DEFAULT = 4, 4
 """Rows and columns of the default array."""
+OFF_WAVELENGTHS = 0.02
+"""Maximum distance between antenna positions of arrays that count as the same, wavelengths."""
 
 Shape = tuple[int, int]
 
@@ -139,10 +141,8 @@ def scene_of_sionna(
         devices = _by_places(places, a.shape[:2], shape, SPEED_OF_LIGHT / first.frequency_hz, what)
     else:
         assert shape is not None, "_elements returns a shape for synthetic arrays"
-        devices = [
-            _Device(place, _orientation(own, towards, shape, what), planar_array(*shape))
-            for place, own, towards in zip(first.targets, a, direction, strict=True)
-        ]
+        turns = _orientations(np.where(valid, a, 0), direction, shape, what)
+        devices = [_Device(place, turn, planar_array(*shape)) for place, turn in zip(first.targets, turns, strict=True)]
     return scene_of_snapshots(
         np.moveaxis(snapshots, (0, 1, 2), (1, 2, 0))[:, :, None],
         first.sources,
@@ -220,17 +220,32 @@ def _by_places(
     own = places.reshape(receivers, -1, 3)[:, :antennas]
     centres = own.mean(1)
     offsets = (own - centres[:, None]) / wavelength
-    off_wavelengths = 0.02  # maximum distance of antenna positions from those of a planar array, wavelengths
     if shape is not None:
         regular = planar_array(*shape)
         turns = [Rotation.align_vectors(one, regular)[0] for one in offsets]
         worst = max(np.abs(turn.apply(regular) - one).max() for turn, one in zip(turns, offsets, strict=True))
-        if worst < off_wavelengths:
+        if worst < OFF_WAVELENGTHS:
             return [_Device(place, _quaternion(turn), regular) for place, turn in zip(centres, turns, strict=True)]
-    if np.abs(offsets - offsets[0]).max() > off_wavelengths:
+    if np.abs(offsets - offsets[0]).max() > OFF_WAVELENGTHS:
         raise UserError(f"the receivers of {name} have arrays of different shapes or orientations; give --array ROWSxCOLUMNS")
     level = np.array([1.0, 0, 0, 0])
     return [_Device(place, level, offsets[0]) for place in centres]
+
+
+def _orientations(
+    a: Complex[np.ndarray, "r e t k"], direction: Float[np.ndarray, "r t k 3"], shape: Shape, name: str
+) -> list[Float[np.ndarray, "4"]]:
+    """Returns the orientations (wxyz) of the receivers' planar arrays; a receiver without any path has that of the others if
+    these agree."""
+    found = {r: _orientation(a[r], direction[r], shape, name) for r in np.flatnonzero(np.abs(a).max((1, 2, 3), initial=0) > 0)}
+    own = np.array([_rotation(one).apply(planar_array(*shape)) for one in found.values()])
+    silent = [r for r in range(len(a)) if r not in found]
+    if silent and (not found or np.abs(own - own[0]).max() > OFF_WAVELENGTHS):
+        raise UserError(
+            f"receiver {silent[0] + 1} of {name} has no path, so that the orientation of its array is unknown; remove it, or "
+            "trace with synthetic_array=False"
+        )
+    return [found.get(r, next(iter(found.values()))) for r in range(len(a))]
 
 
 def _orientation(
@@ -287,6 +302,10 @@ def _fit(a: Complex[np.ndarray, "e n"], towards: Float[np.ndarray, "n 3"], eleme
 
 def _quaternion(turn: Rotation) -> Float[np.ndarray, "4"]:
     return np.roll(turn.as_quat(), 1)
+
+
+def _rotation(quaternion: Float[np.ndarray, "4"]) -> Rotation:
+    return Rotation.from_quat(np.roll(quaternion, -1))
 
 
 def _swapped(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
