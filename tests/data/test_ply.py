@@ -118,6 +118,12 @@ def test_truncated_text(polygon_file):
     bad(polygon_file, "truncated")
 
 
+@pytest.mark.parametrize("text", ["0 0 0 9\n1 0 0 9\n0 1 0 9\n", "0 0 0\n1 0 0\n0 1 0\n1 1 0\n"], ids=["columns", "rows"])
+def test_text_with_more_numbers_than_declared(tmp_path, text):
+    (tmp_path / "x.ply").write_text(HEADER.format(n=3, m=0, name="vertex_indices") + text)
+    bad(tmp_path / "x.ply", "3 numbers more than its header declares")
+
+
 @pytest.mark.parametrize("corner", [-1, 3])
 def test_faces_that_point_nowhere(tmp_path, corner):
     ascii_ply(tmp_path / "x.ply", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, corner)])

@@ -72,6 +72,12 @@ def test_obj_with_curved_surfaces_is_refused(tmp_path):
         read_objects(tmp_path / "a.obj")
 
 
+def test_obj_with_vertices_in_a_plane_is_refused(tmp_path):
+    (tmp_path / "a.obj").write_text("o floor\n" + "v 0 0\nv 5 0\nv 5 5\n" * 2 + "f 1 2 3\n")
+    with pytest.raises(UserError, match=r"a\.obj has the vertex 'v 0 0' without x, y and z"):
+        read_objects(tmp_path / "a.obj")
+
+
 def test_obj_that_calls_another_file_is_refused_and_outlines_are_faces(tmp_path):
     (tmp_path / "a.obj").write_text(FLOOR.replace("f ", "fo "))
     assert found(tmp_path / "a.obj")["floor"][0] == 30

@@ -174,6 +174,8 @@ def _elements(elements: list[_Element], body: _Body) -> dict[str, Columns]:
         if element.rows * least > len(body.cells) - start:
             raise _Damaged(f"{element.rows} rows of {element.name} are declared, but the data end before")
         found[element.name], start = _columns(element, body, start)
+    if body.is_text and start < len(body.cells):
+        raise _Damaged(f"{len(body.cells) - start} numbers more than its header declares")
     return found
 
 

@@ -27,7 +27,7 @@ def read_obj(file: Path) -> list[Body]:
     """Returns the objects of a file.
 
     Raises:
-        UserError: curved surfaces, or faces with corners that do not exist.
+        UserError: curved surfaces, vertices without three coordinates, or faces with corners that do not exist.
     """
     statements = list(_statements(_text(file.read_bytes())))
     begins = "o" if any(words[0] == "o" for words in statements) else "g"
@@ -37,6 +37,8 @@ def read_obj(file: Path) -> list[Body]:
     for number, words in enumerate(statements, 1):
         match words[0]:
             case "v":
+                if len(words) < 4:
+                    raise UserError(f"{file} has the vertex '{' '.join(words)}' without x, y and z; export it again")
                 vertices.append([float(word) for word in words[1:4]])
             case "f" | "fo":  # the former name
                 corners = [_corner(word, len(vertices), file) for word in words[1:]]
