@@ -126,6 +126,38 @@ def safe_name(name: str) -> str:
     return re.sub(r"[^\w+. -]+", "_", name).strip("._ ")[:longest_name] or "data"
 
 
+def read_csv(path: Path) -> tuple[list[str], Iterator[tuple[int, list[str]]]]:
+    """Returns the names of the columns of a CSV file, in lower case, and its rows with their line numbers, without empty rows.
+
+    Raises:
+        UserError: the file is not a CSV file, names a column twice, or (from the iterator) a row has another number of cells.
+    """
+    rows = _csv_rows(path)
+    names = [name.lower() for name in next(rows, (1, []))[1]]
+    if twice := [name for name in names if name and names.count(name) > 1]:
+        raise UserError(f"{path} has two columns {twice[0]!r}; name every column once")
+    return names, rows
+
+
+def _csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yields the line number and the cells of every row that is not empty."""
+    reader = csv.reader(io.StringIO(read_text(path)))
+    count = None
+    try:
+        for row in reader:
+            if not any(map(str.strip, row)):
+                continue
+            count = count or len(row)
+            if len(row) != count:
+                raise UserError(
+                    f"line {reader.line_num} of {path} has {len(row)} cells, but the header has {count}; write decimal points, "
+                    "and one cell per column"
+                )
+            yield reader.line_num, [cell.strip() for cell in row]
+    except csv.Error as error:
+        raise UserError(f"line {reader.line_num} of {path} is not CSV ({error}); check its quotation marks") from error
+
+
 def write_csv(path: Path | str, rows: Iterable[Iterable[Any]]) -> None:
     """Writes rows, a header first, as a CSV file, atomically."""
     text = io.StringIO(newline="")

@@ -6,8 +6,6 @@ integrates to 4 pi; losses belong to the transmitted power. A file without polar
 antenna.
 """
 
-import csv
-import io
 import re
 from pathlib import Path
 
@@ -15,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Inexact
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import read_arrays, read_text
+from wbgs_jax._util.files import read_arrays, read_csv, read_text
 from wbgs_jax.radio.antenna import Antenna, tabulated, zenith_weights
 
 CUT = 360
@@ -47,8 +45,7 @@ def read_antenna(path: Path) -> Antenna:
 
 
 def _read_csv(path: Path) -> Antenna:
-    rows = csv.reader(io.StringIO(read_text(path)))
-    names = [name.strip().lower() for name in next(rows, [])]
+    names, rows = read_csv(path)
     vertical = next((name for name in ("zenith_deg", "elevation_deg", "elevation") if name in names), "zenith_deg")
     components = ("theta_re", "theta_im", "phi_re", "phi_im")  # columns of a CSV file with fields instead of gains
     values = ("gain_dbi",) if "gain_dbi" in names else components
@@ -62,13 +59,11 @@ def _read_csv(path: Path) -> Antenna:
     columns = [names.index(name) for name in (*needed, *optional)]
     table = []
     most_rows = 1_000_000  # largest number of directions: finer than half a degree
-    for row in rows:
-        if not any(cell.strip() for cell in row):
-            continue
+    for line, row in rows:
         try:
             table.append([float(row[column]) for column in columns])
-        except (ValueError, IndexError):
-            raise UserError(f"line {rows.line_num} of {path} lacks a number; fill {', '.join(needed)}") from None
+        except ValueError:
+            raise UserError(f"line {line} of {path} lacks a number; fill {', '.join(needed)}") from None
         if len(table) > most_rows:
             raise UserError(f"{path} has more than {most_rows:,} directions; give a coarser grid")
     found = np.array(table, np.float64).reshape(-1, len(columns))

@@ -1,8 +1,6 @@
 """Queries from command lines and files: transmitters and frequencies, in all combinations or in pairs."""
 
-import csv
 import hashlib
-import io
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,7 +12,7 @@ from jaxtyping import Float, Int
 
 from wbgs_jax._util.cli import parse_vector
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import read_text
+from wbgs_jax._util.files import read_csv
 
 COLUMNS = ("x", "y", "z", "ghz")
 """Columns of a file of queries."""
@@ -173,20 +171,18 @@ def read_positions(path: Path) -> Float[np.ndarray, "n 3"]:
 
 def _read_columns(path: Path, columns: tuple[str, ...], name: str) -> Float[np.ndarray, "n columns"]:
     """Returns columns of a CSV file, the first three of which are positions, metres."""
-    rows, needed = csv.DictReader(io.StringIO(read_text(path))), ",".join(columns)
+    (names, rows), needed = read_csv(path), ",".join(columns)
     units = "metres, gigahertz" if "ghz" in columns else "metres"
-    names = [name.strip().lower() for name in rows.fieldnames or ()]
     if missing := [column for column in columns if column not in names]:
         raise UserError(f"{path} has no column {', '.join(missing)}; its first line must name {needed} ({units})")
-    rows.fieldnames = names
-    found = []
-    for row in rows:
+    places, found = [names.index(column) for column in columns], []
+    for line, row in rows:
         try:
-            values = [float(row[column]) for column in columns]
-        except (TypeError, ValueError):
+            values = [float(row[place]) for place in places]
+        except ValueError:
             values = [np.nan]
         if not np.isfinite(values).all():
-            raise UserError(f"line {rows.line_num} of {path} lacks a number; give {needed} ({units})")
+            raise UserError(f"line {line} of {path} lacks a number; give {needed} ({units})")
         found.append(values)
         check_count(len(found), str(path))
     if not found:
