@@ -80,6 +80,21 @@ def test_arrays_of_other_units(rng, tmp_path, name):
         load_deepmimo(tmp_path / "nowhere", 3.5e9)
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [("power", np.inf, "is infinite"), *((name, np.nan, "is not finite") for name in ("phase", "delay", "aod_az", "aoa_el"))],
+)
+def test_paths_with_a_power_have_all_values(rng, tmp_path, name, value, words):
+    arrays = as_deepmimo(two_rays(rng)[0])
+    arrays[name][3, 0] = value
+    write_deepmimo(tmp_path, arrays, 3.5e9)
+    with pytest.raises(UserError, match=f"{name} in .* {words}"):
+        load_deepmimo(tmp_path)
+    arrays["power"][3, 0] = np.nan
+    write_deepmimo(tmp_path, arrays, 3.5e9)
+    assert load_deepmimo(tmp_path).valid.sum() == arrays["power"].size - 1
+
+
 def two_rays(rng, n=30):
     """Line of sight and an image below a metal floor, isotropic antennas."""
     tx, users = np.array([[0.0, 0, 2]]), np.column_stack([rng.uniform(3, 40, n), rng.uniform(-5, 5, n), np.full(n, 1.5)])

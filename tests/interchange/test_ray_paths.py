@@ -1,17 +1,17 @@
 """Paths as Sionna RT's: round trips, a line of sight in closed form, a field's own paths, and the scenes that follow."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders.drawn_paths import draw_paths
+from builders.drawn_paths import bounced_paths, draw_paths
 from jaxtyping import TypeCheckError
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import TEST, load_scene, save_scene
-from wbgs_jax.interchange.ray_paths import SPECULAR, RayPaths, from_paths, from_sionna, load_paths, save_paths
+from wbgs_jax.interchange.ray_paths import SPECULAR, RayPaths, check_paths, from_paths, from_sionna, load_paths, save_paths
 from wbgs_jax.interchange.scenes import scene_of_paths, scene_of_snapshots
 from wbgs_jax.propagation.paths import REFLECTED, TRANSMITTED
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array, steering_vector
@@ -64,6 +64,27 @@ def test_what_are_no_paths(rng, tmp_path):
     (tmp_path / "a.npz").write_bytes(b"nothing")
     with pytest.raises(UserError, match="damaged"):
         load_paths(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("tau", np.nan, "tau of a valid path is not finite"),
+        ("phi_r", np.nan, "phi_r of a valid path is not finite"),
+        ("theta_t", -0.5, r"theta_t is -0\.5 to .*; give angles from \+z, 0 to pi"),
+        ("theta_r", 4.0, r"theta_r is .* to 4; give angles from \+z, 0 to pi"),
+    ],
+)
+def test_values_that_no_valid_path_has(rng, name, value, words):
+    paths = bounced_paths(rng)
+    check_paths(paths, "room")
+    changed = getattr(paths, name).copy()
+    changed[1, 0, 2] = value
+    with pytest.raises(UserError, match=f"room: {words}"):
+        check_paths(replace(paths, **{name: changed}), "room")
+    valid = paths.valid.copy()
+    valid[1, 0, 2] = False
+    check_paths(replace(paths, **{name: changed}, valid=valid), "room")
 
 
 def test_backwards_twice_is_forwards(rng):

@@ -244,6 +244,7 @@ def _complete(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray
     if missing := [name for name in NEEDED if name not in arrays]:
         raise UserError(f"{path} has no {missing[0]}; a DeepMIMO scenario needs {', '.join(NEEDED)}")
     _check_shapes(path, arrays)
+    _check_finite(path, arrays)
     _check_units(path, arrays)
     return arrays
 
@@ -263,6 +264,16 @@ def _check_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
         if len(shape) != 2 or found.shape not in allowed:
             expected = " or ".join(map(str, allowed))
             raise UserError(f"{name} in {path} has shape {found.shape}; expected {expected}: users, paths, ...")
+
+
+def _check_finite(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Raises a `UserError` for infinite powers, and for paths with a power but without phase, delay or directions."""
+    power = np.asarray(arrays["power"], np.float64)
+    if np.isposinf(power).any():
+        raise UserError(f"power in {path} is infinite; give decibels, and NaN where a user has fewer paths")
+    for name in PATHS[1:]:
+        if not np.isfinite(arrays[name][np.isfinite(power)]).all():
+            raise UserError(f"{name} in {path} is not finite for a path with a power; write the scenario again")
 
 
 def _check_units(path: Path, arrays: dict[str, np.ndarray]) -> None:

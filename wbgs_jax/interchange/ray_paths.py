@@ -343,10 +343,16 @@ def check_paths(paths: RayPaths, name: str) -> None:
     if not np.isfinite(paths.a[valid]).all() or (gain := np.abs(paths.a[valid]).max()) > largest_gain:
         found = "not finite" if not np.isfinite(paths.a[valid]).all() else f"{gain:.3g}"
         raise UserError(f"{name}: a path amplifies (|a| is {found}); give amplitudes, not decibels")
+    for column in NEEDED[1:]:
+        if not np.isfinite(getattr(paths, column)[valid]).all():
+            raise UserError(f"{name}: {column} of a valid path is not finite; give its value, or valid=False")
+    rounding = 1e-3  # by which angles may exceed their range, radians
     for angle in ("theta_t", "phi_t", "theta_r", "phi_r"):
-        largest = np.abs(getattr(paths, angle)[valid]).max()
-        if not largest <= 2 * np.pi + 1e-3:
+        values = getattr(paths, angle)[valid]
+        if (largest := np.abs(values).max()) > 2 * np.pi + rounding:
             raise UserError(f"{name}: {angle} is {largest:.3g}; give radians, not degrees")
+        if angle.startswith("theta") and (values.min() < -rounding or values.max() > np.pi + rounding):
+            raise UserError(f"{name}: {angle} is {values.min():.3g} to {values.max():.3g}; give angles from +z, 0 to pi")
     length = SPEED_OF_LIGHT * paths.tau
     longest_m = 1e6  # maximum length of a path
     if (longest := length[valid].max()) > longest_m:
