@@ -87,6 +87,17 @@ def test_values_that_no_valid_path_has(rng, name, value, words):
     check_paths(replace(paths, **{name: changed}, valid=valid), "room")
 
 
+@pytest.mark.parametrize("end", ["r", "t"])
+def test_directions_without_lines_of_sight_are_compared_with_vertices(rng, end):
+    paths = bounced_paths(rng, direct=False)
+    check_paths(paths, "room")
+    theta, phi = f"theta_{end}", f"phi_{end}"
+    elevation = {theta: np.abs(np.pi / 2 - getattr(paths, theta)), phi: getattr(paths, phi) + 1}
+    with pytest.raises(UserError, match=f"theta_{end}, phi_{end} of reflected .* degrees from the nearest vertex"):
+        check_paths(replace(paths, **elevation), "room")
+    check_paths(replace(paths, vertices=np.full_like(paths.vertices, np.nan), **elevation), "room")
+
+
 def test_backwards_twice_is_forwards(rng):
     paths = draw_paths(rng)
     back = paths.reversed()

@@ -372,7 +372,7 @@ def check_paths(paths: RayPaths, name: str) -> None:
 
 def _check_vertices(paths: RayPaths, name: str, length: Float[np.ndarray, "r t k"]) -> None:
     """Raises a `UserError` if most paths differ in length from the line through their vertices, or from the straight line if
-    they have none."""
+    they have none, or in direction from their first and last vertices."""
     if not len(paths.interactions):  # not recorded
         return
     here, along = np.broadcast_to(paths.sources[None, :, None], (*length.shape, 3)), np.zeros(length.shape)
@@ -389,6 +389,9 @@ def _check_vertices(paths: RayPaths, name: str, length: Float[np.ndarray, "r t k
             f"{name}: a path from transmitter {t + 1} to receiver {r + 1} is {long:.3g} m long, but {drawn:.3g} m "
             "through its vertices; give positions in metres, in one frame, with a row of three numbers for every position"
         )
+    first = np.where(paths.interactions[0][..., None] != NONE, paths.vertices[0], paths.targets[:, None, None])
+    bent = complete & (paths.interactions != NONE).any(0)
+    _check_directions(paths, name, bent, {"r": here, "t": first}, "of reflected and diffracted paths", "the nearest vertex")
 
 
 def _check_line_of_sight(
@@ -396,17 +399,27 @@ def _check_line_of_sight(
 ) -> None:
     """Raises a `UserError` if lines of sight do not arrive from the other end."""
     same, same_m = 1e-4, 0.01  # relative and absolute tolerance within which a path counts as the line of sight
-    # Maximum deviation of the angles of lines of sight from those of their ends, and minimum distance between these.
-    aside_degrees, nearest_m = 10.0, 0.5
-    sight = paths.valid & (np.abs(length - straight) <= straight * same + same_m) & (straight > nearest_m)
-    if not sight.any():
-        return
-    towards = (paths.sources - paths.targets[:, None])[:, :, None] / np.maximum(straight, nearest_m)[..., None]
-    for end, sign in (("r", 1), ("t", -1)):
+    sight = paths.valid & (np.abs(length - straight) <= straight * same + same_m)
+    ends = {"r": paths.sources[None, :, None], "t": paths.targets[:, None, None]}
+    _check_directions(paths, name, sight, ends, "of lines of sight", "the other end")
+
+
+def _check_directions(
+    paths: RayPaths, name: str, chosen: Bool[np.ndarray, "r t k"], seen: dict[str, np.ndarray], which: str, where: str
+) -> None:
+    """Raises a `UserError` if most of the chosen paths do not begin and end in the directions of the points `seen` from the
+    receivers ("r") and transmitters ("t")."""
+    aside_degrees, nearest_m = 10.0, 0.5  # maximum deviation, and minimum distance of the points
+    for end, place in (("r", paths.targets[:, None, None]), ("t", paths.sources[None, :, None])):
+        offset = np.broadcast_to(seen[end] - place, (*chosen.shape, 3))
+        distance = np.linalg.norm(offset, axis=-1)
+        far = chosen & (distance > nearest_m)
+        if not far.any():
+            continue
         found = directions_of(getattr(paths, f"theta_{end}"), getattr(paths, f"phi_{end}"))
-        cosine = np.sum(found * sign * towards, -1)[sight]
+        cosine = np.sum(found * offset, -1)[far] / distance[far]
         if (aside := np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1)))) > aside_degrees:
             raise UserError(
-                f"{name}: theta_{end}, phi_{end} of lines of sight deviate {aside:.0f} degrees from the other end; give angles "
+                f"{name}: theta_{end}, phi_{end} {which} deviate {aside:.0f} degrees from {where}; give angles "
                 "in the frame of the positions, theta from +z, phi from +x, outwards at both ends"
             )
