@@ -153,6 +153,17 @@ def test_a_receiver_without_paths_is_oriented_as_the_others(rng, without):
         scene_of_sionna(joined_receivers(turned, silent, one), "street")
 
 
+def test_the_recorded_frequency_is_the_one_of_the_paths(rng):
+    arrays = Traced(rng).arrays
+    assert scene_of_sionna(arrays, "street", FREQUENCY * (1 + 1e-6)).frequencies_hz.tolist() == [FREQUENCY]
+    with pytest.raises(UserError, match=r"street is for 3\.5 GHz, not 2\.8; leave out --ghz"):
+        scene_of_sionna(arrays, "street", 2.8e9)
+    with pytest.raises(UserError, match=r"street is for several frequencies, 3\.5 to 60 GHz"):
+        scene_of_sionna(arrays | {"frequency_hz": np.array([FREQUENCY, 60e9])}, "street")
+    with pytest.raises(UserError, match="the frequency of street is nan Hz"):
+        scene_of_sionna(arrays | {"frequency_hz": np.array("28 GHz")}, "street")
+
+
 def test_vertices_of_the_other_side_are_in_the_other_order(rng):
     """Also in the raw arrays of several bounces, whose lengths are compared with their vertices."""
     paths = bounced_paths(rng)

@@ -200,12 +200,7 @@ def load_deepmimo(
         raise UserError(f"cannot read {path}: the scenario does not exist; check the path")
     tracing = entry if isinstance(entry, dict) else {}
     found = tracing.get("frequency")
-    recorded = float(found) if isinstance(found, int | float) else None
-    if frequency_hz is None and recorded is None:
-        raise UserError(f"{path} does not record its frequency; give --ghz, as in the scenario's parameters")
-    if frequency_hz is not None and recorded is not None and not np.isclose(recorded, frequency_hz, rtol=1e-3):
-        raise UserError(f"{path} is for {recorded / 1e9:g} GHz, not {frequency_hz / 1e9:g}; leave out --ghz")
-    frequency = frequency_of(recorded if frequency_hz is None else frequency_hz)
+    frequency = frequency_of(found if isinstance(found, int | float) else None, frequency_hz, str(path))
     pairs = pairs_of(path, tx_set, tx, rx_set) if path.is_dir() else []
     found_arrays = [read_pair(path, pair) for pair in pairs] if pairs else [read_file(path)]
     every = [_complete(path, arrays) for arrays in found_arrays]

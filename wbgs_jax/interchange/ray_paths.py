@@ -104,15 +104,14 @@ def from_sionna(paths: Any, frequency_hz: float | None = None, antennas: tuple[i
         The paths, in radians and seconds.
 
     Raises:
-        UserError: an array is missing or has other axes, or devices have several antennas and none is chosen.
+        UserError: an array is missing or has other axes, the frequency is unknown or contradicts the recorded one, or devices
+            have several antennas and none is chosen.
     """
     found = {name: values for name in OF_PATHS if (values := array_of(paths, name)) is not None}
     if "interactions" not in found:
         found.pop("vertices", None)  # positions of unknown interactions
     check_arrays(found, "these paths")
-    frequency = array_of(paths, "frequency_hz") if frequency_hz is None else frequency_hz
-    if frequency is None:
-        raise UserError("these paths do not record their frequency; give that of the scene that they were traced in")
+    frequency = frequency_of(array_of(paths, "frequency_hz"), frequency_hz, "this set of paths")
     if found["a"].ndim == ARRAYS:
         several = found["a"].shape[1], found["a"].shape[3]
         if antennas is None and several != (1, 1):
@@ -129,7 +128,7 @@ def from_sionna(paths: Any, frequency_hz: float | None = None, antennas: tuple[i
         valid=np.asarray(single.get("valid", (real["tau"] >= 0) & (single["a"] != 0)), bool),
         sources=_places(paths, "sources", shape[1], (antennas or (0, 0))[1]),
         targets=_places(paths, "targets", shape[0], (antennas or (0, 0))[0]),
-        frequency_hz=frequency_of(frequency),
+        frequency_hz=frequency,
     )
 
 
@@ -254,14 +253,28 @@ def array_of(paths: Any, name: str) -> np.ndarray | None:
     return np.asarray(value)
 
 
-def frequency_of(value: Any) -> float:
-    """Returns a frequency in hertz, the first one of several."""
+def frequency_of(recorded: Any, given: float | None, what: str) -> float:
+    """Returns the frequency (hertz) that paths record, or the given one if they record nothing.
+
+    Raises:
+        UserError: neither exists, they differ, or several frequencies are recorded.
+    """
+    if recorded is None and given is None:
+        raise UserError(f"{what} does not record its frequency; give --ghz, the frequency of the scene that was traced")
     try:
-        found = float(np.reshape(value, -1)[0])
-    except (ValueError, TypeError, IndexError):
-        found = np.nan
+        every = np.asarray(given if recorded is None else recorded, np.float64).reshape(-1)
+    except (ValueError, TypeError):
+        every = np.zeros(0)
+    found = float(every[0]) if len(every) else np.nan
     if not LOWEST_OF_PATHS_HZ <= found <= MAX_FREQUENCY_HZ:
-        raise UserError(f"the frequency of these paths is {found:g} Hz; give hertz, such as 28e9 for 28 GHz")
+        raise UserError(f"the frequency of {what} is {found:g} Hz; give hertz, such as 28e9 for 28 GHz")
+    same = 1e-3  # relative difference of frequencies that count as the same, for rounding
+    if not np.allclose(every, found, rtol=same, atol=0):
+        raise UserError(
+            f"{what} is for several frequencies, {every.min() / 1e9:g} to {every.max() / 1e9:g} GHz; give one file each"
+        )
+    if given is not None and not np.isclose(given, found, rtol=same, atol=0):
+        raise UserError(f"{what} is for {found / 1e9:g} GHz, not {given / 1e9:g}; leave out --ghz")
     return found
 
 

@@ -26,6 +26,7 @@ from wbgs_jax.interchange.ray_paths import (
     check_arrays,
     check_paths,
     directions_of,
+    frequency_of,
     from_sionna,
     places_of,
 )
@@ -118,18 +119,15 @@ def scene_of_sionna(
     for end in ("sources", "targets"):
         if (found := array_of(paths, end)) is not None:
             arrays[end] = places_of(found, not isinstance(paths, Mapping), f"{end} of {what}")
-    if (found := array_of(paths, "frequency_hz")) is not None:
-        arrays["frequency_hz"] = found
-    elif frequency_hz is None:
-        raise UserError(f"{what} does not record its frequency; give --ghz, the frequency of the scene that it was traced in")
+    frequency = frequency_of(array_of(paths, "frequency_hz"), frequency_hz, what)
     arrays = _swapped(arrays) if swap else arrays
     if arrays["a"].ndim < ARRAYS:
-        single = from_sionna(arrays, frequency_hz)
+        single = from_sionna(arrays, frequency)
         check_paths(single, what)
         return scene_of_paths([single], planar_array(*(shape or DEFAULT)), name, room=room)
     tx_index = _chosen(arrays["a"].shape[3], tx_antenna, f"the transmitters of {what} have", "--tx-antenna")
     chosen, shape = _elements(arrays["a"], shape, port, what)
-    first = from_sionna(arrays, frequency_hz, antennas=(int(chosen[0]), tx_index))
+    first = from_sionna(arrays, frequency, antennas=(int(chosen[0]), tx_index))
     check_paths(first, what)
     if len(chosen) == 1:
         return scene_of_paths([first], planar_array(*(shape or DEFAULT)), name, room=room)
@@ -314,7 +312,7 @@ def _swapped(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     other |= {value: key for key, value in other.items()}
 
     def exchanged(name: str, values: np.ndarray) -> np.ndarray:
-        if name in ("sources", "targets", "frequency_hz"):
+        if name in ("sources", "targets"):
             return values
         before = int(name in ("interactions", "vertices"))
         if before and "interactions" in arrays:
