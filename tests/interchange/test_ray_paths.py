@@ -11,7 +11,16 @@ from jaxtyping import TypeCheckError
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import TEST, load_scene, save_scene
-from wbgs_jax.interchange.ray_paths import SPECULAR, RayPaths, check_paths, from_paths, from_sionna, load_paths, save_paths
+from wbgs_jax.interchange.ray_paths import (
+    SPECULAR,
+    RayPaths,
+    check_paths,
+    from_paths,
+    from_sionna,
+    load_paths,
+    read_paths,
+    save_paths,
+)
 from wbgs_jax.interchange.scenes import scene_of_paths, scene_of_snapshots
 from wbgs_jax.propagation.paths import REFLECTED, TRANSMITTED
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array, steering_vector
@@ -61,6 +70,16 @@ def test_what_are_no_paths(rng, tmp_path):
         from_sionna({name: values for name, values in arrays.items() if name != "tau"})
     with pytest.raises(UserError, match="phi_r of these paths has shape"):
         from_sionna(arrays | {"phi_r": arrays["phi_r"][:1]})
+    with pytest.raises(UserError, match=r"a of these paths is not complex but float64; .* or a_real and a_imag"):
+        from_sionna(arrays | {"a": np.abs(arrays["a"])})
+    with pytest.raises(UserError, match=r"a of these paths has shape \(0, 6, 4\); expected receivers"):
+        from_sionna(arrays | {"a": arrays["a"][:0, 0, :, 0]})
+    for imaginary in (arrays["a"].imag[..., :2], np.array(["x"])):
+        with pytest.raises(UserError, match="a of these paths has the parts float64 of shape"):
+            from_sionna(arrays | {"a": (arrays["a"].real, imaginary)})
+        np.savez(tmp_path / "a.npz", a_real=arrays["a"].real, a_imag=imaginary)
+        with pytest.raises(UserError, match=r"a of .*a\.npz has the parts float64 of shape"):
+            read_paths(tmp_path / "a.npz")
     (tmp_path / "a.npz").write_bytes(b"nothing")
     with pytest.raises(UserError, match="damaged"):
         load_paths(tmp_path / "a.npz")

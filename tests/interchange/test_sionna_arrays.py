@@ -158,8 +158,9 @@ def test_the_recorded_frequency_is_the_one_of_the_paths(rng):
     assert scene_of_sionna(arrays, "street", FREQUENCY * (1 + 1e-6)).frequencies_hz.tolist() == [FREQUENCY]
     with pytest.raises(UserError, match=r"street is for 3\.5 GHz, not 2\.8; leave out --ghz"):
         scene_of_sionna(arrays, "street", 2.8e9)
-    with pytest.raises(UserError, match=r"street is for several frequencies, 3\.5 to 60 GHz"):
-        scene_of_sionna(arrays | {"frequency_hz": np.array([FREQUENCY, 60e9])}, "street")
+    for several in ([FREQUENCY, 60e9], np.array([FREQUENCY, FREQUENCY, 60e9])):
+        with pytest.raises(UserError, match=r"street is for several frequencies, 3\.5 to 60 GHz"):
+            scene_of_sionna(arrays | {"frequency_hz": several}, "street")
     with pytest.raises(UserError, match="the frequency of street is nan Hz"):
         scene_of_sionna(arrays | {"frequency_hz": np.array("28 GHz")}, "street")
 

@@ -133,8 +133,8 @@ def from_sionna(paths: Any, frequency_hz: float | None = None, antennas: tuple[i
 
 
 def check_arrays(arrays: Mapping[str, np.ndarray], what: str) -> None:
-    """Raises a `UserError` for arrays of `OF_PATHS` that are missing, not numeric, or do not have the receivers, transmitters
-    and paths of `a`, with or without axes of antennas.
+    """Raises a `UserError` for arrays of `OF_PATHS` that are missing, not numeric (`a`: complex), or do not have the receivers,
+    transmitters and paths of `a`, with or without axes of antennas.
 
     Args:
         arrays: by name.
@@ -143,17 +143,19 @@ def check_arrays(arrays: Mapping[str, np.ndarray], what: str) -> None:
     if missing := [name for name in NEEDED if name not in arrays]:
         raise UserError(f"{what} have no {missing[0]}; give a sionna.rt.Paths object or its arrays by name")
     for name, values in arrays.items():
-        if values.dtype.kind not in ("cfiu" if name == "a" else "fiub"):
-            raise UserError(f"{name} of {what} is not numeric but {values.dtype}; write it again")
+        kinds, wanted, advice = ("c", "complex", ", or a_real and a_imag") if name == "a" else ("fiub", "numeric", "")
+        if values.dtype.kind not in kinds:
+            raise UserError(f"{name} of {what} is not {wanted} but {values.dtype}; write it again{advice}")
     of_a = arrays["a"].shape
-    if len(of_a) not in (SINGLE, ARRAYS):
+    if len(of_a) not in (SINGLE, ARRAYS) or 0 in of_a[:-1]:
         raise UserError(f"a of {what} has shape {of_a}; expected receivers, transmitters and paths")
     for name, values in arrays.items():
         shape = values.shape[int(name in ("interactions", "vertices")) :][: -1 if name == "vertices" else None]
         known = arrays["interactions"].shape if "interactions" in arrays else values.shape[:-1]
         if name == "vertices" and values.shape != (*known, 3):
             shape = ()
-        if (shape[::2] if len(shape) == ARRAYS else shape) != (of_a[::2] if len(of_a) == ARRAYS else of_a):
+        ends = shape[::2] if len(shape) == ARRAYS else shape
+        if ends != (of_a[::2] if len(of_a) == ARRAYS else of_a) or 0 in shape[:-1]:
             raise UserError(f"{name} of {what} has shape {values.shape}, which does not fit a with {of_a}")
 
 
@@ -239,18 +241,26 @@ def read_paths(path: Path | str) -> dict[str, np.ndarray]:
     """
     arrays = read_arrays(Path(path), "", "check the path, or write it again")
     if "a_real" in arrays and "a_imag" in arrays:
-        arrays["a"] = arrays.pop("a_real") + 1j * arrays.pop("a_imag")
+        arrays["a"] = _complex(arrays.pop("a_real"), arrays.pop("a_imag"), f"a of {path}")
     return arrays
 
 
 def array_of(paths: Any, name: str) -> np.ndarray | None:
-    """Returns an array by key or attribute; a pair of arrays, such as Sionna's `a`, becomes a complex one."""
+    """Returns an array by key or attribute; a pair of arrays for `a`, as Sionna has it, becomes a complex one."""
     value = paths.get(name) if isinstance(paths, Mapping) else getattr(paths, name, None)
     if value is None:
         return None
-    if isinstance(value, tuple | list) and len(value) == 2:
-        return np.asarray(value[0]) + 1j * np.asarray(value[1])
+    if name == "a" and isinstance(value, tuple | list) and len(value) == 2:
+        return _complex(*map(np.asarray, value), "a of these paths")
     return np.asarray(value)
+
+
+def _complex(real: np.ndarray, imaginary: np.ndarray, what: str) -> np.ndarray:
+    """Returns a complex array from its two parts."""
+    if not {real.dtype.kind, imaginary.dtype.kind} <= set("fiu") or real.shape != imaginary.shape:
+        parts = " and ".join(f"{part.dtype} of shape {part.shape}" for part in (real, imaginary))
+        raise UserError(f"{what} has the parts {parts}; give real numbers of one shape for both")
+    return real + 1j * imaginary
 
 
 def frequency_of(recorded: Any, given: float | None, what: str) -> float:
