@@ -1,5 +1,7 @@
 """Tabulated antennas against parametric ones in closed form, and their files."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -180,6 +182,26 @@ def test_an_msi_file_adds_the_attenuations_of_its_cuts(tmp_path, gain, dbi):
     np.testing.assert_allclose(along, np.linalg.norm(found, axis=-1), rtol=1e-5)  # vertically polarised
 
 
+def table(gain, azimuths=range(0, 360, 30)):
+    rows = [f"{a},{z},{gain(a, z)}" for z in range(0, 181, 30) for a in azimuths]
+    return "\n".join(["azimuth_deg,zenith_deg,gain_dbi", *rows])
+
+
+def test_repeated_directions_have_one_value(tmp_path):
+    """Azimuths of 0 and 360 degrees may both be measured, but two frequencies have no common table."""
+    azimuths = range(0, 361, 30)
+    for name, last, fits in (("a.csv", 2.2, True), ("b.csv", -3, False), ("c.csv", "nan", False)):
+        (tmp_path / name).write_text(table(lambda a, z, last=last: last if a == 360 else 2, azimuths))
+        if fits:
+            assert read_antenna(tmp_path / name)
+        else:
+            with pytest.raises(UserError, match=r"different values for one direction|gains beyond 80 dBi"):
+                read_antenna(tmp_path / name)
+    parts = (f"{a},{z},1,0,{1e-17 * (a == 360)},0" for z in range(0, 181, 30) for a in azimuths)
+    (tmp_path / "d.csv").write_text("\n".join(["azimuth_deg,zenith_deg,theta_re,theta_im,phi_re,phi_im", *parts]))
+    assert read_antenna(tmp_path / "d.csv")
+
+
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
@@ -190,6 +212,8 @@ def test_an_msi_file_adds_the_attenuations_of_its_cuts(tmp_path, gain, dbi):
         ("a.csv", "azimuth_deg,zenith_deg,gain_dbi\n0,0,-3,5\n", "line 2 of .* has 4 cells, but the header has 3"),
         ("a.csv", "azimuth_deg,zenith_deg,gain_dbi,gain_dbi\n0,0,1,2\n", "two columns 'gain_dbi'"),
         ("a.csv", 'azimuth_deg,zenith_deg,gain_dbi\n0,0,"1\n' + "0,0,1\n" * 30_000, "check its quotation marks"),
+        ("a.csv", table(lambda a, z: 40 if a < 60 else 30), "gains of 34 dB on average over the sphere"),
+        ("a.msi", re.sub(r"(?m)^(\d+) ", r"\1 -", msi()), "attenuations down to -30 dB; give positive"),
         ("a.csv", "azimuth_deg,zenith_deg,gain_dbi\n0,0,100\n", "beyond 80 dBi"),
         ("a.pln", "NAME x\nGAIN 3\n", "not an MSI Planet file"),
         ("a.msi", msi().replace("\n90 ", "\n91 "), "not an MSI Planet file"),

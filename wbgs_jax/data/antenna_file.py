@@ -73,10 +73,9 @@ def _read_csv(path: Path) -> Antenna:
         amplitude: Inexact[np.ndarray, " n"] = 10 ** (found[:, 2] / 20)
         if optional:
             amplitude = amplitude * np.exp(1j * np.radians(found[:, 3]))
-        return _antenna(path, on_grid(path, zenith, found[:, 0], amplitude), None)
-    fields = found[:, [2, 4]] + 1j * found[:, [3, 5]]
-    theta, phi = (on_grid(path, zenith, found[:, 0], fields[:, i]) for i in range(2))
-    return _antenna(path, theta, phi)
+        return _antenna(path, on_grid(path, zenith, found[:, 0], amplitude[:, None])[..., 0], None)
+    fields = on_grid(path, zenith, found[:, 0], found[:, [2, 4]] + 1j * found[:, [3, 5]])
+    return _antenna(path, fields[..., 0], fields[..., 1])
 
 
 def _read_archive(path: Path) -> Antenna:
@@ -90,8 +89,9 @@ def _read_archive(path: Path) -> Antenna:
     for name in ("e_theta", "e_phi"):
         if arrays[name].shape != shape or arrays[name].dtype.kind not in "fc":
             raise UserError(f"{name} of {path} has shape {arrays[name].shape}; give numbers of shape {shape}, like the angles")
-        fields.append(on_grid(path, zenith, azimuth, np.asarray(arrays[name], np.complex128).reshape(-1)))
-    return _antenna(path, *fields)
+        fields.append(np.asarray(arrays[name], np.complex128).reshape(-1))
+    found = on_grid(path, zenith, azimuth, np.stack(fields, -1))
+    return _antenna(path, found[..., 0], found[..., 1])
 
 
 def _read_msi(path: Path) -> Antenna:
@@ -106,6 +106,9 @@ def _read_msi(path: Path) -> Antenna:
             f"{path} is not an MSI Planet file; it needs GAIN, and below HORIZONTAL 360 and VERTICAL 360 360 lines each of "
             "an angle and an attenuation"
         ) from None
+    least_db = -0.5  # smallest attenuation, for rounding and a maximum between two degrees
+    if (lowest := min(horizontal.min(), vertical.min())) < least_db:
+        raise UserError(f"{path} has attenuations down to {lowest:g} dB; give positive decibels below the largest gain")
     _check_decibels(path, np.concatenate([gain - horizontal, gain - vertical]))
     zenith, azimuth = np.arange(181), np.arange(CUT)
     attenuation = vertical[(zenith[:, None] - 90) % CUT] + horizontal[-azimuth % CUT]
@@ -132,13 +135,13 @@ def _check_decibels(path: Path, values: Float[np.ndarray, " n"]) -> None:
 
 
 def on_grid(
-    path: Path, zenith_deg: Float[np.ndarray, " n"], azimuth_deg: Float[np.ndarray, " n"], values: Inexact[np.ndarray, " n"]
-) -> Inexact[np.ndarray, "zenith azimuth"]:
+    path: Path, zenith_deg: Float[np.ndarray, " n"], azimuth_deg: Float[np.ndarray, " n"], values: Inexact[np.ndarray, "n k"]
+) -> Inexact[np.ndarray, "zenith azimuth k"]:
     """Returns values of directions in any order on their regular grid: zenith angles 0..180 degrees, azimuths from 0 without
     360.
 
     Raises:
-        UserError: the directions are not such a grid, or values are not finite.
+        UserError: the directions are not such a grid, values are not finite, or those of one direction differ.
     """
     azimuth_deg = np.round(azimuth_deg, 6) % 360
     zeniths, azimuths = np.unique(np.round(zenith_deg, 6)), np.unique(azimuth_deg)
@@ -152,10 +155,15 @@ def on_grid(
             "degrees, at equal distances"
         )
     row, column = np.searchsorted(zeniths, np.round(zenith_deg, 6)), np.searchsorted(azimuths, azimuth_deg)
-    table = np.full((len(zeniths), len(azimuths)), np.nan, values.dtype)
+    table = np.full((len(zeniths), len(azimuths), values.shape[1]), np.nan, values.dtype)
     table[row, column] = values
-    if not np.isfinite(table).all():
+    if not (np.isfinite(values).all() and np.isfinite(table).all()):
         raise UserError(f"{path} lacks a finite value in some directions of its grid; give one for every direction")
+    same = (
+        0.05  # maximum difference of repeated values (azimuths 0 and 360) relative to the largest one: noise of a measurement
+    )
+    if np.abs(table[row, column] - values).max() > same * np.abs(values).max():
+        raise UserError(f"{path} has different values for one direction; give a single frequency and polarisation per file")
     return table
 
 
@@ -163,9 +171,15 @@ def _antenna(
     path: Path, theta: Inexact[np.ndarray, "zenith azimuth"], phi: Inexact[np.ndarray, "zenith azimuth"] | None
 ) -> Antenna:
     """Returns the antenna of amplitude gains (without `phi`), or of fields in any unit, which are scaled."""
+    power = np.abs(theta) ** 2 + (0 if phi is None else np.abs(phi) ** 2)
+    mean = float(np.sum(power.mean(1) * zenith_weights(len(power))))
+    largest_mean = 2.0  # maximum mean power gain: 1 for a passive antenna, and an error of two cuts that were combined
+    if phi is None and mean > largest_mean:
+        raise UserError(
+            f"{path} has gains of {10 * np.log10(mean):.3g} dB on average over the sphere, more than a passive antenna; give "
+            "decibels relative to an isotropic antenna, not powers or attenuations"
+        )
     if phi is not None:
-        power = np.abs(theta) ** 2 + np.abs(phi) ** 2
-        mean = float(np.sum(power.mean(1) * zenith_weights(len(power))))
         if not mean > 0:
             raise UserError(f"{path} has no field in any direction; export it again")
         theta, phi = theta / np.sqrt(mean), phi / np.sqrt(mean)
