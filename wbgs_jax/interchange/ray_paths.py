@@ -251,7 +251,8 @@ def array_of(paths: Any, name: str) -> np.ndarray | None:
     if value is None:
         return None
     if name == "a" and isinstance(value, tuple | list) and len(value) == 2:
-        return _complex(*map(np.asarray, value), "a of these paths")
+        real, imaginary = map(np.asarray, value)
+        return _complex(real, imaginary, "a of these paths")
     return np.asarray(value)
 
 

@@ -235,7 +235,7 @@ def _orientations(
 ) -> list[Float[np.ndarray, "4"]]:
     """Returns the orientations (wxyz) of the receivers' planar arrays; a receiver without any path has that of the others if
     these agree."""
-    found = {r: _orientation(a[r], direction[r], shape, name) for r in np.flatnonzero(np.abs(a).max((1, 2, 3), initial=0) > 0)}
+    found = {r: _orientation(one, direction[r], shape, name) for r, one in enumerate(a) if one.any()}
     own = np.array([_rotation(one).apply(planar_array(*shape)) for one in found.values()])
     silent = [r for r in range(len(a)) if r not in found]
     if silent and (not found or np.abs(own - own[0]).max() > OFF_WAVELENGTHS):
