@@ -1,10 +1,10 @@
-"""Files are whole or absent; JSON is valid or refused."""
+"""Files are whole or absent; JSON and YAML are valid or refused."""
 
 import pytest
 
 from wbgs_jax._util import files
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write, read_json, write_json
+from wbgs_jax._util.files import atomic_write, read_json, read_yaml, write_json
 
 
 def test_atomic_write_replaces_the_file(tmp_path):
@@ -58,6 +58,19 @@ def test_missing_or_broken_json_is_a_user_error(tmp_path, content):
         path.write_bytes(content)
     with pytest.raises(UserError, match=r"v\.json"):
         read_json(path)
+
+
+def test_numbers_in_yaml_are_decimal(tmp_path):
+    (tmp_path / "a.yml").write_text("a: [7, -2, 0, 1.5e-3, .5, 010, 1:30, 0x10, 1_000, 1:30.5]\nb: yes\n")
+    numbers, texts = [7, -2, 0, 1.5e-3, 0.5], ["010", "1:30", "0x10", "1_000", "1:30.5"]
+    assert read_yaml(tmp_path / "a.yml") == {"a": numbers + texts, "b": True}
+
+
+@pytest.mark.parametrize("text", ["ap: 1\nb: 2\nap: 3\n", "a:\n  ap: 1\n  'ap': 2\n", "- {ap: 1, ap: 1}\n"])
+def test_a_key_given_twice_in_yaml_is_refused(tmp_path, text):
+    (tmp_path / "a.yml").write_text(text)
+    with pytest.raises(UserError, match=r"a\.yml is not valid YAML \(it has the key 'ap' more than once\); correct it"):
+        read_yaml(tmp_path / "a.yml")
 
 
 def test_what_a_killed_writer_left_is_removed_and_what_another_one_writes_is_not(tmp_path, monkeypatch):

@@ -277,7 +277,8 @@ def _reason(error: Exception) -> str:
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """PyYAML's safe loader without aliases."""
+    """PyYAML's safe loader without aliases and repeated keys, and with decimal numbers only: YAML 1.1 also reads 010 as 8 and
+    1:30 as 90."""
 
     deepest = 20
     """Maximum number of levels of nesting, far more than files of positions need."""
@@ -293,6 +294,22 @@ class _PlainLoader(yaml.SafeLoader):
         node = super().compose_node(parent, index)
         self.depth -= 1
         return node
+
+    def resolve(self, kind: Any, value: Any, implicit: Any) -> Any:
+        """Returns the tag of a node; numbers that are not decimal are text."""
+        tag = super().resolve(kind, value, implicit)
+        numeric = tag in ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
+        decimal = r"[-+]?(0|[1-9]\d*|\d*\.\d*([eE][-+]?\d+)?|\.inf|\.nan)"
+        return self.DEFAULT_SCALAR_TAG if numeric and not re.fullmatch(decimal, value, re.IGNORECASE) else tag
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        """Returns a mapping; repeated keys are errors."""
+        found = super().construct_mapping(node, deep)
+        if len(found) < len(node.value):
+            keys = [key.value for key, _ in node.value]
+            twice = next((key for key in keys if keys.count(key) > 1), keys[-1])
+            raise yaml.YAMLError(f"it has the key {str(twice)[:40]!r} more than once")
+        return found
 
 
 def read_yaml(path: Path) -> Any:
