@@ -154,6 +154,32 @@ def test_the_frequency_and_the_users_are_those_of_the_parameters(rng, tmp_path):
         load_deepmimo(tmp_path)
 
 
+def test_a_scenario_has_one_frequency(rng, tmp_path):
+    arrays = as_deepmimo(two_rays(rng)[0])
+    write_deepmimo(tmp_path, arrays, 3.5e9)
+    write_deepmimo(tmp_path, arrays, 28e9)  # instead of the one before
+    with pytest.raises(UserError, match="has other transmitters or users at 28 GHz, not 60; choose another folder"):
+        write_deepmimo(tmp_path, arrays, 60e9, tx=1)
+    write_deepmimo(tmp_path, arrays, 28e9, tx=1)
+    assert load_deepmimo(tmp_path).frequency_hz == 28e9 and load_deepmimo(tmp_path).a.shape[1] == 2
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "{broken",
+        '{"txrx_sets": [{"id": 1}]}',
+        '{"txrx_sets": {"txrx_set_1": 7}}',
+        '{"txrx_sets": {"txrx_set_1": {"num_points": "x"}}}',
+    ],
+)
+def test_damaged_parameters_are_refused_before_anything_is_written(rng, tmp_path, content):
+    (tmp_path / "params.json").write_text(content)
+    with pytest.raises(UserError, match=r"params\.json"):
+        write_deepmimo(tmp_path, as_deepmimo(two_rays(rng)[0]), 3.5e9)
+    assert [path.name for path in tmp_path.iterdir()] == ["params.json"]
+
+
 def test_transmitters_of_different_users_are_a_choice(rng, tmp_path):
     for number in (0, 1):
         write_deepmimo(tmp_path, as_deepmimo(two_rays(rng)[0]), 3.5e9, tx=number)

@@ -24,7 +24,17 @@ from jaxtyping import Bool, Float
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, read_arrays, read_json, write_json
 from wbgs_jax.interchange.matlab import read_mat
-from wbgs_jax.interchange.ray_paths import DIFFRACTION, DIFFUSE, NONE, REFRACTION, SPECULAR, RayPaths, carrier, frequency_of
+from wbgs_jax.interchange.ray_paths import (
+    DIFFRACTION,
+    DIFFUSE,
+    NONE,
+    REFRACTION,
+    SAME_FREQUENCY,
+    SPECULAR,
+    RayPaths,
+    carrier,
+    frequency_of,
+)
 
 FILE = re.compile(r"(?P<name>[a-z_]+?)_t(?P<set>\d+)_tx(?P<tx>\d+)_r(?P<rx>\d+)\.(npz|mat)")
 PARAMETERS = "params.json"
@@ -48,7 +58,7 @@ def pairs_of(folder: Path, tx_set: int | None = None, tx: int | None = None, rx_
     Raises:
         UserError: there is none.
     """
-    every = {Pair(int(m["set"]), int(m["tx"]), int(m["rx"])) for m in _matches(folder)}
+    every = {_pair(match) for match in _matches(folder)}
     wanted = (tx_set, tx, rx_set)
     found = [pair for pair in sorted(every) if all(want in (None, have) for want, have in zip(wanted, pair, strict=True))]
     if not found:
@@ -75,7 +85,7 @@ def read_pair(folder: Path, pair: Pair) -> dict[str, np.ndarray]:
     """Returns the arrays of a transmitter and its users by name."""
     arrays: dict[str, np.ndarray] = {}
     for match in _matches(folder):
-        if Pair(int(match["set"]), int(match["tx"]), int(match["rx"])) == pair:
+        if _pair(match) == pair:
             content = read_file(folder / match.string)
             arrays[match["name"]] = content.get(match["name"], next(iter(content.values()), np.zeros(0)))
     return arrays
@@ -96,14 +106,28 @@ def parameters(folder: Path) -> dict[str, Any]:
 
 
 def write_pair(folder: Path, pair: Pair, arrays: dict[str, np.ndarray], frequency_hz: float) -> None:
-    """Writes the arrays of a transmitter and its users, and records both in params.json."""
+    """Writes the arrays of a transmitter and its users, and records both in params.json.
+
+    Raises:
+        UserError: params.json is damaged, or the scenario has other transmitters or users at another frequency.
+    """
+    recorded = parameters(folder)
+    sets = recorded.get("txrx_sets", {})
+    own = sets.get(f"txrx_set_{pair.tx_set}", {}) if isinstance(sets, dict) else None
+    before = own.get("num_points", 0) if isinstance(own, dict) else None
+    if not isinstance(before, int | float):
+        raise UserError(f"{folder / PARAMETERS} has no valid txrx_sets; remove it, or choose another folder")
+    frequency = _traced(recorded)[1]
+    others = {_pair(match) for match in _matches(folder)} - {pair} if folder.is_dir() else ()
+    if others and frequency is not None and not np.isclose(frequency, frequency_hz, rtol=SAME_FREQUENCY, atol=0):
+        raise UserError(
+            f"{folder} has other transmitters or users at {frequency / 1e9:g} GHz, not {frequency_hz / 1e9:g}; choose another "
+            "folder"
+        )
     for name, values in arrays.items():
         one: dict[str, Any] = {name: values}
         with atomic_write(folder / f"{name}_t{pair.tx_set:03}_tx{pair.tx:03}_r{pair.rx_set:03}.npz") as stream:
             np.savez_compressed(stream, **one)
-    recorded = parameters(folder)
-    sets = recorded.get("txrx_sets", {})
-    before = sets.get(f"txrx_set_{pair.tx_set}", {}).get("num_points", 0)
     active = int(np.isfinite(arrays["power"]).any(1).sum())
     sets |= {
         f"txrx_set_{pair.tx_set}": _set(pair.tx_set, "transmitters", max(before, pair.tx + 1), max(before, pair.tx + 1), True),
@@ -126,6 +150,14 @@ def write_pair(folder: Path, pair: Pair, arrays: dict[str, np.ndarray], frequenc
     )
 
 
+def _traced(recorded: dict[str, Any]) -> tuple[str, float | None]:
+    """Returns the name of the ray tracer and the frequency (hertz) in the content of params.json; None if it has none."""
+    entry = recorded.get("rt_params")
+    tracing = entry if isinstance(entry, dict) else {}
+    frequency = tracing.get("frequency")
+    return str(tracing.get("raytracer_name", "")), float(frequency) if isinstance(frequency, int | float) else None
+
+
 def _set(number: int, name: str, points: int, active: int, sends: bool) -> dict[str, Any]:
     places = {"num_points": points, "num_active_points": active, "num_ant": 1, "dual_pol": False}
     facing = {"ant_rel_positions": [[0, 0, 0]], "array_orientation": [0, 0, 0]}
@@ -134,6 +166,11 @@ def _set(number: int, name: str, points: int, active: int, sends: bool) -> dict[
 
 def _matches(folder: Path) -> list[re.Match[str]]:
     return [match for entry in sorted(folder.iterdir()) if (match := FILE.fullmatch(entry.name))]
+
+
+def _pair(match: re.Match[str]) -> Pair:
+    """Returns the transmitter and users in the name of a file."""
+    return Pair(int(match["set"]), int(match["tx"]), int(match["rx"]))
 
 
 def _sends(folder: Path, number: int, every: set[Pair]) -> bool:
@@ -195,12 +232,11 @@ def load_deepmimo(
         UserError: the scenario does not exist, an array is missing, or the frequency is unknown or contradicts the recorded
             one.
     """
-    path, entry = Path(path), parameters(Path(path)).get("rt_params", {})
+    path = Path(path)
     if not path.exists():
         raise UserError(f"cannot read {path}: the scenario does not exist; check the path")
-    tracing = entry if isinstance(entry, dict) else {}
-    found = tracing.get("frequency")
-    frequency = frequency_of(found if isinstance(found, int | float) else None, frequency_hz, str(path))
+    tracer, recorded_hz = _traced(parameters(path))
+    frequency = frequency_of(recorded_hz, frequency_hz, str(path))
     pairs = pairs_of(path, tx_set, tx, rx_set) if path.is_dir() else []
     found_arrays = [read_pair(path, pair) for pair in pairs] if pairs else [read_file(path)]
     every = [_complete(path, arrays) for arrays in found_arrays]
@@ -208,7 +244,7 @@ def load_deepmimo(
         choices = ", ".join(str(pair.tx) for pair in pairs)
         raise UserError(f"{path}: its {len(every)} transmitters have different users; choose one, --tx-index {choices}")
     without_propagation = ("sionna",)  # ray tracers whose phases DeepMIMO's converters copy without the propagation
-    lacks = any(name in str(tracing.get("raytracer_name", "")).lower() for name in without_propagation)
+    lacks = any(name in tracer.lower() for name in without_propagation)
     return joined([from_deepmimo(one, frequency, not lacks) for one in every])
 
 
@@ -311,6 +347,9 @@ def write_deepmimo(
         arrays: from `as_deepmimo`.
         frequency_hz: of the carrier.
         tx_set, tx, rx_set: numbers in the names of the files.
+
+    Raises:
+        UserError: params.json is damaged, or the scenario has other transmitters or users at another frequency.
     """
     write_pair(Path(folder), Pair(tx_set, tx, rx_set), arrays, frequency_hz)
 

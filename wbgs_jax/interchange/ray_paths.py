@@ -30,6 +30,8 @@ NEEDED = ("a", "tau", "theta_t", "phi_t", "theta_r", "phi_r")
 OF_PATHS = (*NEEDED, "valid", "interactions", "vertices")
 SINGLE, ARRAYS = 3, 5
 """Number of axes: receivers, transmitters, paths; and with an axis of antennas after each of the first two."""
+SAME_FREQUENCY = 1e-3
+"""Relative difference up to which frequencies count as the same, for rounding."""
 
 
 @dataclass(frozen=True)
@@ -279,12 +281,11 @@ def frequency_of(recorded: Any, given: float | None, what: str) -> float:
     found = float(every[0]) if len(every) else np.nan
     if not LOWEST_OF_PATHS_HZ <= found <= MAX_FREQUENCY_HZ:
         raise UserError(f"the frequency of {what} is {found:g} Hz; give hertz, such as 28e9 for 28 GHz")
-    same = 1e-3  # relative difference of frequencies that count as the same, for rounding
-    if not np.allclose(every, found, rtol=same, atol=0):
+    if not np.allclose(every, found, rtol=SAME_FREQUENCY, atol=0):
         raise UserError(
             f"{what} is for several frequencies, {every.min() / 1e9:g} to {every.max() / 1e9:g} GHz; give one file each"
         )
-    if given is not None and not np.isclose(given, found, rtol=same, atol=0):
+    if given is not None and not np.isclose(given, found, rtol=SAME_FREQUENCY, atol=0):
         raise UserError(f"{what} is for {found / 1e9:g} GHz, not {given / 1e9:g}; leave out --ghz")
     return found
 
