@@ -115,7 +115,7 @@ def write_pair(folder: Path, pair: Pair, arrays: dict[str, np.ndarray], frequenc
     sets = recorded.get("txrx_sets", {})
     own = sets.get(f"txrx_set_{pair.tx_set}", {}) if isinstance(sets, dict) else None
     before = own.get("num_points", 0) if isinstance(own, dict) else None
-    if not isinstance(before, int | float):
+    if not isinstance(before, int):
         raise UserError(f"{folder / PARAMETERS} has no valid txrx_sets; remove it, or choose another folder")
     frequency = _traced(recorded)[1]
     others = {_pair(match) for match in _matches(folder)} - {pair} if folder.is_dir() else ()
