@@ -167,7 +167,7 @@ def test_the_recorded_frequency_is_the_one_of_the_paths(rng):
 
 def test_vertices_of_the_other_side_are_in_the_other_order(rng):
     """Also in the raw arrays of several bounces, whose lengths are compared with their vertices."""
-    paths = bounced_paths(rng)
+    paths = bounced_paths(rng, direct=False)
     turned = scene_of_sionna(paths.as_sionna(), "room", swap=True)
     expected = scene_of_sionna(paths.reversed().as_sionna(), "room")
     np.testing.assert_allclose(turned.snapshots, expected.snapshots)
