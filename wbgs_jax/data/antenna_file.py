@@ -159,9 +159,7 @@ def on_grid(
     table[row, column] = values
     if not (np.isfinite(values).all() and np.isfinite(table).all()):
         raise UserError(f"{path} lacks a finite value in some directions of its grid; give one for every direction")
-    same = (
-        0.05  # maximum difference of repeated values (azimuths 0 and 360) relative to the largest one: noise of a measurement
-    )
+    same = 0.05  # maximum difference of repeated values (azimuths 0 and 360), relative to the largest: noise of a measurement
     if np.abs(table[row, column] - values).max() > same * np.abs(values).max():
         raise UserError(f"{path} has different values for one direction; give a single frequency and polarisation per file")
     return table
