@@ -52,8 +52,8 @@ def tx_disjoint_split(
 
 def hold_out_validation(dataset: Dataset, fraction: float = VALIDATION) -> Dataset:
     """Returns the dataset with `fraction` of its training transmitters moved to the validation part. If these are fewer than
-    eight, eight are moved, but no more than about a quarter, since fewer would decide nothing. Of fewer than `FEWEST` none is moved
-    unless `fraction` is at least one of them: calibration needs them all, and a single one decides nothing.
+    eight, eight are moved, but no more than about a quarter, since fewer would decide nothing. Of fewer than `FEWEST` none is
+    moved unless `fraction` is at least one of them: calibration needs them all, and a single one decides nothing.
 
     The choice depends only on the split, not on a run's seed or on what is trained. Data with a validation part of their own
     are unchanged.
