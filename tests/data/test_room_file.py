@@ -52,6 +52,8 @@ def test_beside_snapshots_objects_keep_their_materials(tmp_path, room, rng):
     mesh = DatasetScene(dataset).mesh()
     np.testing.assert_allclose(mesh.thickness, [0.2, 0.04])
     assert load_room(tmp_path / "mine.npz").parts == PARTS, "a scene file holds a room, too"
+    with pytest.raises(UserError, match="snapshots of mine are real; give complex voltages"):
+        scene_of_snapshots(np.abs(snapshots), *places, "mine", room=room)
 
 
 @pytest.mark.parametrize(

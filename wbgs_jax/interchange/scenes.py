@@ -100,7 +100,7 @@ def scene_of_snapshots(
         The scene, for `save_scene`.
 
     Raises:
-        UserError: there are too few transmitters, or the shapes do not match.
+        UserError: there are too few transmitters, the shapes do not match, or the snapshots are real.
     """
     count, receivers = len(tx_positions), len(rx_position)
     wanted = count, receivers, len(frequencies_hz), len(element_positions)
@@ -109,6 +109,8 @@ def scene_of_snapshots(
             f"the snapshots of {name} have shape {np.shape(snapshots)}; by transmitter, receiver, frequency and element it "
             f"must be {wanted}"
         )
+    if not np.iscomplexobj(snapshots):
+        raise UserError(f"the snapshots of {name} are real; give complex voltages, not magnitudes or powers")
     transmitter = group_transmitters(tx_positions)  # repeated measurements at one position count once
     if (places := len(np.unique(transmitter))) < FEWEST:
         raise UserError(f"{name} has {places} transmitters, but training needs {FEWEST}")
