@@ -184,14 +184,14 @@ class Session:
         place, hertz, domain = np.asarray(position, np.float64)[None], np.array([frequency_hz]), self.loaded.domain
         outside = bool(domain.outside(place)[0])
         valid = not (outside or domain.out_of_band(hertz)[0])
-        valid = valid and not (expected is not None and np.isnan(expected[0]))  # at the receiver
+        sure = valid and expected is not None and np.isfinite(expected[0])
         received = power is not None and self.has_power and power > NO_PATH_DB
         return Answer(
             pas=pas,
             power_db=float(power) if received else None,
             within_db=float(within) if received and valid and within is not None and np.isfinite(within) else None,
             power_level=None if learned[2] is None else float(learned[2].level),
-            expected=tuple(float(value) for value in expected) if valid and expected is not None else None,  # type: ignore[arg-type]
+            expected=tuple(float(value) for value in expected) if sure else None,  # type: ignore[arg-type]
             level=None if learned[1] is None else float(learned[1].level),
             paths=None if paths is None else self._listed(*paths),
             outside=outside,
