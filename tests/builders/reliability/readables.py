@@ -13,6 +13,7 @@ import trimesh
 from plyfile import PlyData
 from scipy.io import savemat
 
+from builders.drawn_paths import angles_of
 from builders.synthetic import tiny_dataset, tiny_scene
 from builders.untrained import make_run, make_trained
 from data_gen import jobs as batches
@@ -58,7 +59,7 @@ class Readable:
 
 
 def _paths() -> RayPaths:
-    """Paths that meet one or two surfaces, as long as the lines through these places."""
+    """Paths that meet one or two surfaces, with the lengths and directions of the lines through these places."""
     draw = np.random.default_rng(0)
     shape, met = (6, 2, 3), draw.choice([1, 4, 8], (2, 6, 2, 3)).astype(np.int32)
     met[1] *= draw.integers(0, 2, shape)
@@ -69,7 +70,7 @@ def _paths() -> RayPaths:
     return RayPaths(
         a=0.1 * (draw.normal(size=shape) + 1j * draw.normal(size=shape)),
         tau=sum(np.linalg.norm(leg, axis=-1) for leg in legs) / SPEED_OF_LIGHT,
-        **{name: draw.uniform(0.1, 3, shape) for name in ("theta_t", "phi_t", "theta_r", "phi_r")},
+        **dict(zip(("theta_t", "phi_t", "theta_r", "phi_r"), (*angles_of(legs[0]), *angles_of(-legs[2])), strict=True)),
         interactions=met,
         vertices=vertices,
         valid=np.ones(shape, bool),
