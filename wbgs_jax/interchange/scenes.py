@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Inexact
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import TEST, TRAIN, Room, SceneFile
@@ -67,7 +67,7 @@ def scene_of_paths(
 
 
 def scene_of_snapshots(
-    snapshots: Complex[np.ndarray, "tx rx freq elements"],
+    snapshots: Inexact[np.ndarray, "tx rx freq elements"],
     tx_positions: Float[np.ndarray, "tx 3"],
     frequencies_hz: Float[np.ndarray, " freq"],
     rx_position: Float[np.ndarray, "rx 3"],
