@@ -210,7 +210,7 @@ def statistics() -> list[Case]:
     def learned(count: int) -> tuple[Any, ...]:
         return jnp.zeros(count), jnp.ones(count), jnp.linspace(-0.5, 0.5, count + 1)
 
-    of_spectra = jnp.zeros(3), places, *learned(FEATURES), jnp.array([-1.0, 1.0]), jnp.ones(()), jnp.ones(())
+    of_spectra = jnp.zeros(3), places, *learned(FEATURES), jnp.array([-1.0, 1.0]), jnp.ones(()), jnp.ones(()), jnp.zeros(0)
     spectra, powers = Confidence(*of_spectra), PowerConfidence(*(places, *learned(POWER_FEATURES), *(jnp.ones(()),) * 3))
     return [
         Case("expected_ssim", lambda pas, power: wb.expected_ssim(spectra, pas, query, power), (pas, power), (0, 1)),

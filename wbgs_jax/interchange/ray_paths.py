@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int, Integer
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, read_arrays
@@ -161,7 +161,7 @@ def check_arrays(arrays: Mapping[str, np.ndarray], what: str) -> None:
             raise UserError(f"{name} of {what} has shape {values.shape}, which does not fit a with {of_a}")
 
 
-def backwards(values: np.ndarray, interactions: Int[np.ndarray, "d ..."]) -> np.ndarray:
+def backwards(values: np.ndarray, interactions: Integer[np.ndarray, "d ..."]) -> np.ndarray:
     """Returns interactions, or their vertices, in the order from the receiver to the transmitter; padding stays at the end."""
     number = (interactions != NONE).sum(0)
     place = np.arange(len(interactions)).reshape(-1, *[1] * number.ndim)
