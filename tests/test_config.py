@@ -82,6 +82,8 @@ def test_fields_with_paths_converge_sooner():
         ("wideband", "optim", {"steps": 0}, "optim.steps"),
         ("wideband", "optim", {"steps": 75}, "multiple"),
         ("wideband", "optim", {"batch": 0}, "optim.batch"),
+        ("wideband", "density", {"every": 130}, "density.every 130 is not a multiple"),
+        ("wideband", "density", {"reset_every": 130}, "density.reset-every 130 is not a multiple"),
         ("wideband", "loop", {"keep_checkpoints": 0}, "keep-checkpoints"),
         ("wideband", "field", {"ssim_weight": 1.5}, "wideband.ssim-weight .* between 0 and 1"),
         ("wideband", "field", {"gaussians": 3}, "wideband.gaussians .* at least 4"),

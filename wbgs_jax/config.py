@@ -286,6 +286,12 @@ def check(settings: Settings) -> None:
         raise UserError(
             f"--optim.steps {optim.steps} is not a multiple of --loop.epoch-steps {loop.epoch_steps}; change one of them"
         )
+    if (density := settings.density) and density.every < density.stop_fraction * optim.steps:
+        for name, every in (("every", density.every), ("reset-every", density.reset_every)):
+            if every % loop.epoch_steps:  # it would never be due at the end of an epoch
+                raise UserError(
+                    f"--density.{name} {every} is not a multiple of --loop.epoch-steps {loop.epoch_steps}; change one of them"
+                )
 
 
 def check_positive(values: Mapping[str, int]) -> None:

@@ -11,6 +11,7 @@ from builders.synthetic import FIELDS, tiny_dataset, tiny_scene, tiny_settings
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.commands import train as train_command
+from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.fields import nerf2
 from wbgs_jax.fields.nerf2 import Nerf2Config, Nerf2Field
@@ -82,6 +83,17 @@ def test_rays_along_the_axes_reach_the_faces_opposite():
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     rays = nerf2.make_rays(jnp.asarray(BOX), make_receiver([0.3, -0.2, 1.0]), jnp.asarray(axes, jnp.float32))
     np.testing.assert_allclose(rays.length, [2.7, 2.7, 1.8, 3.3, 1.8, 1.0], rtol=1e-5)
+
+
+def test_rays_do_not_end_at_a_receiver_above_everything():
+    """Without a mesh the box is that of the antennas."""
+    dataset = tiny_dataset(6)
+    high = jnp.asarray(dataset.tx_positions.max(0) + np.array([0, 0, 0.5]), jnp.float32)[None]
+    receivers = dataclasses.replace(dataset.receivers, position=high)
+    without_mesh = {"vertices": np.zeros((0, 3)), "faces": np.zeros((0, 3), int), "face_part": None, "materials": None}
+    dataset = dataclasses.replace(dataset, receivers=receivers, **without_mesh)
+    field = Nerf2Field.build(SETTINGS.field, DatasetScene(dataset), 0)
+    assert float(nerf2.make_rays(field.box, dataset.receiver(), LOCAL).length.min()) > 0.9
 
 
 @pytest.mark.heavy

@@ -55,6 +55,17 @@ def test_few_transmitters_say_one_share_at_most(rng):
     assert not np.any(learn_share(known).weights)
 
 
+def test_the_first_expert_is_used_alone_unless_few_transmitters_show_a_better_weight():
+    def share_for(*gains_of_the_other: float) -> float:
+        gains = np.array(gains_of_the_other)
+        scores = 0.7 + gains[:, None] * (1 - SHARES)
+        known = Scored(np.zeros((len(gains), FEATURES), np.float32), scores, np.arange(len(gains)))
+        return float(share_of(learn_share(known), jnp.zeros((1, FEATURES)))[0])
+
+    assert share_for(0.05) > 0.99 and share_for(0.08, -0.06) > 0.99
+    assert share_for(0.3) < 0.01 and share_for(0.1, 0.08, 0.12) < 0.01
+
+
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
 def test_a_common_share_is_that_of_all_queries(share, rng):
     found = share_of(constant(share), jnp.asarray(rng.normal(size=(5, FEATURES)), jnp.float32))

@@ -140,6 +140,7 @@ def test_it_comes_back_from_a_run_folder_and_belongs_to_its_receiver(dataset, tm
         assert a.dtype == b.dtype
     assert for_receiver(again, dataset.receiver()) is again
     assert for_receiver(again, make_receiver(RX + 0.1)) is None
+    assert for_receiver(again, make_receiver(RX, (np.cos(0.05), 0, 0, np.sin(0.05)))) is None
 
 
 def test_what_is_scored_is_not_known(dataset):

@@ -130,6 +130,7 @@ def test_they_belong_to_one_receiver_and_to_a_run_folder(known, tmp_path):
     neighbours = made(Choice("spectra", 1.0, 0.5), dataset, index, predicted)
     assert for_receiver(neighbours, dataset.receiver()) is neighbours
     assert for_receiver(neighbours, make_receiver(np.add(RX, [0, 0, 0.1]))) is None
+    assert for_receiver(neighbours, make_receiver(RX, (np.cos(0.05), 0, 0, np.sin(0.05)))) is None
     assert for_receiver(None, dataset.receiver()) is None
     write_neighbours(tmp_path, neighbours)
     found, query = read_neighbours(tmp_path), dataset.query(index[:4])

@@ -77,6 +77,13 @@ def test_a_table_of_gains_agrees_with_the_parametric_antenna(pattern, rng):
     assert np.abs(found - exact)[strong].max() < 6e-3 * level.max()
 
 
+@pytest.mark.parametrize("pole", [1.0, -1.0])
+def test_an_isotropic_antenna_radiates_straight_up_and_down(pole):
+    directions = jnp.array([[0.0, 0.0, pole], [1e-3, 0.0, pole]])
+    field = Antenna(None, jnp.zeros(2)).field(directions)
+    np.testing.assert_allclose(field, [[pole, 0, 0]] * 2, atol=2e-3)
+
+
 def test_a_table_of_fields_is_smooth_at_both_poles(rng):
     antenna = tabulated(*crossed())
     k = np.concatenate([directions(rng), [[0, 0, 1], [0, 0, -1], [1e-7, 0, 1], [0, -3e-3, -1], [2e-3, 1e-3, 1]]]).astype(

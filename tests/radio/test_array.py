@@ -176,6 +176,12 @@ def test_the_spectrum_of_a_snapshots_own_product_is_its_own(rng):
     np.testing.assert_allclose(wide_covariance_to_pas(covariance, everywhere), truth, atol=2e-3)
 
 
+@pytest.mark.parametrize("spacing", [0.5, 0.45, 0.7])
+def test_lags_of_a_regular_array_are_counted_once(spacing):
+    positions = np.asarray(jnp.asarray(planar_array(8, 8, spacing), jnp.float32))
+    assert make_lag_basis(positions).basis.shape[1] == 2 * ((2 * 8 - 1) ** 2 // 2 + 1)
+
+
 def test_beams_of_any_array_add_the_powers_of_what_is_not_coherent(rng):
     """An irregular array: the mean power of independent waves from two directions is the sum of their powers."""
     positions = rng.normal(size=(5, 3))

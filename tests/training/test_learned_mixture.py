@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from builders.synthetic import tiny_dataset
 
+from wbgs_jax._util.statistics import lower_bound
 from wbgs_jax.data.splits import hold_out_validation, training_links
 from wbgs_jax.fields.mixture import SHARES
 from wbgs_jax.inference.kriging import mixed_spectra
@@ -22,7 +23,6 @@ from wbgs_jax.training.fit_mixture import (
     learn_members,
     learn_mixture,
     left_out,
-    lower_bound,
     moments_of,
     predict_members,
     ssim_of,
@@ -194,7 +194,7 @@ def test_simple_methods_improve_a_field_with_paths_where_both_err():
 def test_links_of_a_group_are_one_piece_of_evidence(rng):
     gains = np.repeat([0.06, -0.01, 0.05], 40)
     group = np.repeat(np.arange(3), 40)
-    assert lower_bound(gains, 1.0, group) < 0 < lower_bound(gains, 1.0, np.arange(120))
+    assert lower_bound(gains, group, 0.1, 2.0) < 0 < lower_bound(gains, np.arange(120), 0.1, 2.0)
 
 
 def test_a_field_that_is_better_far_away_has_its_share_there():

@@ -215,6 +215,22 @@ def test_of_powers_alone_the_unknown_gain_is_found(rounds, run_on, tmp_path, rng
     assert not rounds or entry["search"]["after"] < entry["search"]["before"] - 0.15, entry
 
 
+@pytest.mark.heavy
+def test_the_level_of_single_elements_is_not_explained_by_antennas(run_on, tmp_path):
+    """A cable of 20 dB before the only element."""
+    search = dataclasses.replace(SETTINGS.calibration, rounds=0, antenna_rounds=1, position_std_spectra=16)
+    run = run_on([ITU_MATERIALS["concrete"]] * len(PARTS), search)
+    receivers = run.data.receivers
+    first = dataclasses.replace(receivers, element_positions=receivers.element_positions[..., :1, :])
+    own = dataclasses.replace(run.data, receivers=first, steering=run.data.steering[..., :1])
+    run.data = own.with_observations(snapshots=0.1 * run.data.snapshots[..., :1])
+    run.run_hooks()
+    entry = json.loads((tmp_path / "metrics.jsonl").read_text())
+    assert (
+        entry["gain_db"] == pytest.approx(-20, abs=10) and not entry["antennas"]["taken"]
+    )  # wrong materials reflect more or less
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("ordinary", [False, True])
 def test_snapshots_in_a_unit_of_their_own_get_a_gain(ordinary, run_on, tmp_path, rng):

@@ -96,3 +96,7 @@ def test_another_receiver_is_in_tune(run, rng):
     other = dataclasses.replace(known, position=known.position + 0.5)
     np.testing.assert_array_equal(field.plan(None, other).array_gains, 0)
     assert np.any(field.plan(None, known).array_gains)
+    larger = dataclasses.replace(known, element_positions=jnp.concatenate([known.element_positions] * 2))
+    assert field.plan(None, larger).array_gains is None
+    twice = dataclasses.replace(field, receivers=jnp.tile(field.receivers, (2, 1)), tuning=jnp.tile(field.tuning, (2, 1, 1)))
+    np.testing.assert_array_equal(twice.plan(None, known).array_gains, 0)  # whose of the two arrays they are is not known

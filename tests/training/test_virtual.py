@@ -56,6 +56,18 @@ def test_they_lie_around_the_known_ones_and_hold_mixtures_of_theirs():
     np.testing.assert_array_equal(virtual_links(dataset.with_observations(pas=poisoned), 0).images, found.images)
 
 
+def test_a_spectrum_without_another_at_its_frequency_is_not_repeated_elsewhere():
+    dataset = tiny_dataset(9, kind="pas")
+    links = len(dataset.frequencies_hz)
+    apart = dataclasses.replace(dataset, frequencies_hz=1e9 + 1e8 * np.arange(links))
+    assert virtual_links(apart, 0) is None
+    pair = dataset.train[np.unique(dataset.tx_index[dataset.train], return_index=True)[1][:2]]
+    frequency = apart.frequencies_hz.copy()
+    frequency[pair] = 5e9
+    found = virtual_links(dataclasses.replace(apart, frequencies_hz=frequency), 0)
+    assert set(found.frequency_hz) == {5e9}
+
+
 def test_who_has_none(monkeypatch):
     dataset = tiny_dataset(9)
     assert virtual_links(tiny_dataset(9, kind="power"), 0) is None

@@ -189,27 +189,27 @@ class WaveField(Calibratable):
         return tree
 
     def _as_found(self, receiver: Receiver) -> tuple[Receiver, Float[Array, "elements 2"] | None]:
-        """Returns a receiver of the data at its estimated position and orientation, with its array gains; any other receiver is
-        returned unchanged, without gains."""
+        """Returns a receiver of the data at its estimated position and orientation, with its array gains; any other receiver,
+        and one of several arrays at the same place, is returned unchanged, without gains."""
         if not len(self.receivers):
             return receiver, None
         known = self.receivers, receiver.position, self.motion.receiver
         xp = jnp if _traced(*known) else np  # mirror images are computed on the host, also inside `jit`
         places, position, shifts = map(xp.asarray, known)
         away = xp.linalg.norm(places - position, axis=-1)
-        own = xp.argmin(away)
-
         same_place_m = 1e-3  # distance, metres, below which two receiver positions count as the same
+        here = away < same_place_m
 
         def found(of_all: Any, xp: Any = jnp) -> Any:
-            return xp.where(away[own] < same_place_m, of_all[own], 0)
+            return xp.where(here.sum() == 1, of_all[here.argmax()], 0)
 
         position = position + found(shifts, xp)
         if xp is np:
             with jax.ensure_compile_time_eval():
                 position = jnp.asarray(position)
         orientation = turned(receiver.orientation, found(self.motion.receiver_turn))
-        array_gains = None if self.tuning is None else found(self.tuning)
+        fits = self.tuning is not None and self.tuning.shape[1] == len(receiver.element_positions)
+        array_gains = found(self.tuning) if fits else None  # None for another array at the place of a receiver of the data
         return dataclasses.replace(receiver, position=position, orientation=orientation), array_gains
 
     def prepare(self, links: Links, receivers: Receiver) -> PreparedPaths:

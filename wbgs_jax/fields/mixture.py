@@ -36,7 +36,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from wbgs_jax._util.pytree import AnyArray, pytree
-from wbgs_jax._util.statistics import standard_error
+from wbgs_jax._util.statistics import lower_bound, standard_error
 from wbgs_jax.fields.base import Observation, Params
 from wbgs_jax.fields.losses import COARSE, ssim, ssim_of_mixtures
 from wbgs_jax.radio.array import EXACT
@@ -45,6 +45,8 @@ from wbgs_jax.types import Query
 
 SHARES = np.linspace(0, 1, 21)
 """Weights of the first of two experts at which links are scored."""
+USUAL_SPREAD = 0.1
+"""Standard deviation over transmitters of the difference in SSIM of two methods, where few transmitters were measured."""
 FEATURES = 7
 """Number of features z of a query."""
 
@@ -177,6 +179,7 @@ def learn_shares(
     tx_index: Int[np.ndarray, " n"],
     predicted: ExpertPredictions,
     worth: Callable[[Any, Any], Any],
+    usual_spread: float = USUAL_SPREAD,
 ) -> Shares:
     """Returns the weights that fit N links best (host), fitted one after the other.
 
@@ -186,10 +189,11 @@ def learn_shares(
         predicted: predictions of the experts.
         worth: returns the scores (n, shares) of the mixtures of two experts on each link, for all weights (`SHARES`) of the
             first.
+        usual_spread: standard deviation over transmitters of the difference of two experts' scores, if few were measured.
     """
-    coherent = learn_share(Scored(features, worth(predicted.coherent, predicted.own), tx_index))
+    coherent = learn_share(Scored(features, worth(predicted.coherent, predicted.own), tx_index), usual_spread)
     first = _mix(np.asarray(share_of(coherent, jnp.asarray(features))), predicted.coherent, predicted.own)
-    return Shares(coherent, learn_share(Scored(features, worth(first, predicted.informed), tx_index)))
+    return Shares(coherent, learn_share(Scored(features, worth(first, predicted.informed), tx_index), usual_spread))
 
 
 def similarity(truth: Float[np.ndarray, "n 90 360"], one: Any, other: Any, stride: int = 1) -> Float[np.ndarray, "n shares"]:
@@ -217,14 +221,20 @@ def nearness(measured_db: Float[np.ndarray, " n"], one: Any, other: Any) -> Floa
     return np.where((measured_db > NO_PATH_DB)[:, None], -np.abs(mixtures - measured_db[:, None]), 0)
 
 
-def learn_share(known: Scored) -> Share:
+def learn_share(known: Scored, usual_spread: float = USUAL_SPREAD) -> Share:
     """Returns the weight that fits links best (host): the same for all, unless the features improve on it by more than a
-    standard error in cross-validation."""
+    standard error in cross-validation. With few transmitters the first expert is used alone, unless another weight is better by
+    more than a standard error."""
     common = constant(_best(known.scores))
     number_of_folds = 5  # folds of the cross-validation over transmitters
     folds = np.unique(known.tx_index, return_inverse=True)[1] % number_of_folds
     if len(np.unique(known.tx_index)) < 2 * number_of_folds:
-        return common
+        gains = known.scores.T - known.scores[:, -1]
+        bounds = [
+            lower_bound(gain, known.tx_index, (1 - share) * usual_spread, 1.0)
+            for gain, share in zip(gains[:-1], SHARES[:-1], strict=True)
+        ]
+        return constant(float(SHARES[np.argmax(bounds)]) if max(bounds) > 0 else 1.0)
     gains = np.zeros(len(folds))
     for fold in range(number_of_folds):
         own, rest = (jax.tree.map(lambda a, keep=keep: a[keep], known) for keep in (folds == fold, folds != fold))

@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from wbgs_jax._util.errors import UserError
@@ -35,6 +36,8 @@ from wbgs_jax.radio.geometry import rotation_matrix, smooth_length, to_local
 from wbgs_jax.types import Batch, Query, Receiver, Scene, Transmitter, check_query, check_receiver
 
 PIXELS = PAS_HEIGHT * PAS_WIDTH
+FLUSH_M, MARGIN_M = 1e-2, 1.0
+"""Distance from the boundary below which a receiver lies on it, and by which the boundary is then moved outwards, metres."""
 
 
 @dataclass(frozen=True)
@@ -127,8 +130,12 @@ class Nerf2Field(Field):
 
     @classmethod
     def build(cls, config: Nerf2Config, scene: Scene, seed: int) -> "Nerf2Field":
-        """Returns the field over the box of a scene."""
-        return cls(jnp.asarray(scene.box, jnp.float32), config)
+        """Returns the field over the box of a scene, which is larger by `MARGIN_M` if a receiver lies on its boundary, where
+        rays would end at once: without a mesh, the antennas alone define it."""
+        (low, high), receivers = scene.box, np.asarray(scene.receivers.position)
+        inside = np.all((receivers > low + FLUSH_M) & (receivers < high - FLUSH_M))
+        margin = 0.0 if inside else MARGIN_M
+        return cls(jnp.asarray([low - margin, high + margin], jnp.float32), config)
 
     def init(self, key: Key[Array, ""]) -> Weights:
         """Returns random weights of the networks."""

@@ -58,6 +58,8 @@ class Neighbours:
     """Residual kriging with M measured spectra of one receiver."""
 
     rx_position: Float[Array, "3"]
+    rx_orientation: Float[Array, "4"]
+    """Quaternion (wxyz); NaN in older files, which do not hold it."""
     tx_position: Float[Array, "m 3"]
     """Metres, world frame."""
     frequency_hz: Float[Array, " m"]
@@ -166,13 +168,17 @@ def _corrected(
 
 def for_receiver(learned: Any, receiver: Receiver) -> Any:
     """Returns what was learned (`Neighbours`, `Mixture`, `Confidence`) restricted to one receiver; None if it was learned
-    for other receivers (host)."""
+    for other receivers, or from spectra in the frame of another orientation (host)."""
     if learned is None:
         return None
     distance = np.linalg.norm(np.asarray(receiver.position) - np.atleast_2d(learned.rx_position), axis=-1)
     near = int(distance.argmin())
     if distance[near] >= SAME_PLACE_M:
         return None
+    if isinstance(learned, Neighbours | Mixture):
+        least_cosine = 1 - 1e-6  # of half the angle between two orientations that count as the same: a sixth of a degree
+        if abs(np.dot(np.asarray(receiver.orientation), np.asarray(learned.rx_orientation))) < least_cosine:
+            return None
     return learned if learned.rx_position.ndim == 1 else dataclasses.replace(learned, rx_position=learned.rx_position[near])
 
 
@@ -184,7 +190,7 @@ def write_neighbours(folder: Path, neighbours: Beside) -> None:
 def read_neighbours(folder: Path) -> Beside:
     """Returns the measurements of a run folder; None if it has none. A damaged file is a `UserError`."""
     classes: tuple[type[Mixture | Neighbours], ...] = (Mixture, Neighbours)
-    return read_tree(folder / FILE, classes, "use the field alone")
+    return read_tree(folder / FILE, classes, "use the field alone", {"rx_orientation": np.full(4, np.nan)})
 
 
 def mixed_spectra(mixture: Mixture, pas: Float[Array, "b 90 360"], query: Query) -> Float[Array, "b 90 360"]:

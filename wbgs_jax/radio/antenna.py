@@ -210,7 +210,8 @@ def dipole_gain(direction: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
 
 
 def zenith_vector(direction: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """Returns the unit vector theta-hat of a unit direction: the electric field direction of a vertically polarised antenna."""
-    x, y, z = jnp.moveaxis(direction, -1, 0)
-    horizontal = jnp.sqrt(jnp.maximum(x * x + y * y, POLE))
+    """Returns the unit vector theta-hat of a unit direction: the electric field direction of a vertically polarised antenna. In
+    the vertical directions, where the azimuth is undefined, it is that of azimuth 0."""
+    x, y, z = jnp.moveaxis(_off_the_axis(direction), -1, 0)
+    horizontal = jnp.sqrt(x * x + y * y)
     return jnp.stack([z * x / horizontal, z * y / horizontal, -horizontal], -1)

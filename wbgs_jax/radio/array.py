@@ -170,7 +170,7 @@ class LagBasis:
 def make_lag_basis(element_positions: Float[np.ndarray, "elements 3"]) -> LagBasis:
     """Returns the lag basis of an array whose element positions (wavelengths) are available on the host."""
     positions = np.asarray(element_positions, np.float64)
-    lags = np.round(positions[None] - positions[:, None], 9) + 0.0
+    lags = np.round(positions[None] - positions[:, None], 6) + 0.0  # single precision separates lags that are the same
     first = np.argmax(np.abs(lags) > 0, -1)
     once = np.take_along_axis(lags, first[..., None], -1)[..., 0] >= 0
     different, lag = np.unique(lags[once], axis=0, return_inverse=True)

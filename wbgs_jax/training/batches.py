@@ -147,8 +147,9 @@ class VirtualLinks(NamedTuple):
 
 
 def virtual_links(dataset: Dataset, seed: int) -> VirtualLinks | None:
-    """Returns virtual links around the training links of a dataset; None if there are `FEW` training links or more, if all have
-    the same transmitter, or if the data have no spectra."""
+    """Returns virtual links around the training links of a dataset; None if there are `FEW` training links or more, if all of
+    a frequency and receiver have the same transmitter, or if the data have no spectra. Links without another transmitter at
+    their frequency have none, since nothing is known about the change of their spectra with the position."""
     train = dataset.train
     positions = dataset.tx_positions[train]
     extent = float(np.linalg.norm(np.ptp(positions, axis=0)))
@@ -156,17 +157,22 @@ def virtual_links(dataset: Dataset, seed: int) -> VirtualLinks | None:
         return None
     rng = np.random.default_rng([seed, 7])
     count = min(4 * len(train), 256)  # virtual links: four per training link, up to a maximum
-    first, second = rng.integers(len(train), size=(2, count))
+    frequency, receiver = dataset.frequencies_hz[train], dataset.receiver_index[train]
+    alike = (frequency[:, None] == frequency) & (receiver[:, None] == receiver)
+    apart = alike & (positions[:, None] != positions).any(-1)
+    if not apart.any():
+        return None
+    first = rng.choice(np.flatnonzero(apart.any(1)), count)
+    second = np.array([rng.choice(np.flatnonzero(alike[one])) for one in first])
     along = rng.uniform(-BEYOND, 1 + BEYOND, (count, 1))
     places = positions[first] + along * (positions[second] - positions[first])
     places += rng.normal(0, BESIDE * extent / np.sqrt(3), places.shape)
     spectra, images = np.asarray(dataset.pas(train)), np.empty((count, 90, 360), np.uint8)
-    frequency, receiver = dataset.frequencies_hz[train], dataset.receiver_index[train]
     length, nugget = 0.5, 0.01  # correlation length of the kriging, relative to the extent of all transmitters, and its nugget
     for i in range(count):
-        alike = np.flatnonzero((frequency == frequency[first[i]]) & (receiver == receiver[first[i]]))
-        weights = kriging_weights(positions[alike], places[i], length * extent, nugget)
-        images[i] = (255 * np.clip(np.tensordot(weights, spectra[alike], 1), 0, 1)).round()
+        known = alike[first[i]]
+        weights = kriging_weights(positions[known], places[i], length * extent, nugget)
+        images[i] = (255 * np.clip(np.tensordot(weights, spectra[known], 1), 0, 1)).round()
     return VirtualLinks(places, frequency[first], receiver[first], images)
 
 

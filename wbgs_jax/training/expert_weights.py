@@ -75,8 +75,13 @@ class ExpertWeights(Hook):
             spectra = learn_shares(
                 features, tx_index, observed_predictions(predicted, floor), partial(similarity, pas, stride=COARSE)
             )
+        usual_spread_db = 3.0  # of the difference in error of two experts, over transmitters
         known = measured_db is not None and np.any(measured_db > NO_PATH_DB)
-        power = coherent_alone() if not known else learn_shares(features, tx_index, powers, partial(nearness, measured_db))
+        power = (
+            coherent_alone()
+            if not known
+            else learn_shares(features, tx_index, powers, partial(nearness, measured_db), usual_spread_db)
+        )
         report = {name: reported(shares, features) for name, shares in (("spectra", spectra), ("power", power))}
         weighted = mixing.field.with_shares(mixing.of(params), spectra, power, floor)
         return same._replace(params=mixing.put(params, weighted), report={"shares": report, "noise_floor": floor})

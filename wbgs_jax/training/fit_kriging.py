@@ -26,7 +26,8 @@ from wbgs_jax.metrics import ssim
 
 Kind = Literal["residuals", "spectra"]
 FEWEST, MOST = 4, 20_000
-"""Minimum number of validation spectra for a decision, and maximum number of measured spectra that are stored (32 kB each)."""
+"""Minimum number of validation transmitters for a decision, and maximum number of measured spectra that are stored (32 kB
+each)."""
 MOST_RESIDUALS = 1000
 """Number of measured spectra above which residuals are not tried: the field was trained on these spectra, and many of them are
 fitted almost without residual."""
@@ -62,8 +63,8 @@ class Learned(NamedTuple):
 def learn_neighbours(field: Field, params: Params, dataset: Dataset) -> Learned:
     """Returns the residual kriging that improves a trained field, if any.
 
-    It is not used for data of several receivers or of received powers, with fewer than `FEWEST` validation spectra, or with
-    more than `MOST` measured spectra.
+    It is not used for data of several receivers or of received powers, with fewer than `FEWEST` validation
+    transmitters, or with more than `MOST` measured spectra.
     """
     links = training_links(dataset)
     if not dataset.has_spectra:
@@ -93,8 +94,9 @@ def _why_not(dataset: Dataset, known: int) -> str:
     """Returns the reason why residual kriging cannot be used for a dataset; empty if it can."""
     if dataset.n_receivers > 1:
         return "the data have several receivers"
-    if len(dataset.validation) < FEWEST:
-        return f"{len(dataset.validation)} validation spectra are too few to measure its gain"
+    held_out = len(np.unique(dataset.tx_index[dataset.validation]))
+    if held_out < FEWEST:
+        return f"{held_out} validation transmitters are too few to measure its gain"
     return f"{known:,} measured spectra are more than {MOST:,}" if known > MOST else ""
 
 
@@ -178,6 +180,7 @@ def make_neighbours(
     spectra = choice.kind == "spectra"
     return Neighbours(
         rx_position=dataset.receiver().position,
+        rx_orientation=dataset.receiver().orientation,
         tx_position=jnp.asarray(dataset.tx_positions[index], jnp.float32),
         frequency_hz=jnp.asarray(dataset.frequencies_hz[index], jnp.float32),
         images=images,

@@ -9,7 +9,6 @@ evidence it is used alone, and simple methods receive a weight only if they impr
 """
 
 import dataclasses
-import functools
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -21,9 +20,9 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from scipy.spatial.distance import pdist
 from scipy.special import expit, logit
 
-from wbgs_jax._util.statistics import by_transmitter, standard_error
+from wbgs_jax._util.statistics import lower_bound, standard_error
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.fields.mixture import SHARES, score_at, similarity
+from wbgs_jax.fields.mixture import SHARES, USUAL_SPREAD, score_at, similarity
 from wbgs_jax.inference.kriging import LOG_METRE, MEMBERS, Mixture, member_spectra, member_weights, scaled_distance
 from wbgs_jax.training.fit_kriging import spacing
 
@@ -360,7 +359,11 @@ def choose_share(
         group: groups of links with correlated errors.
         with_paths: whether the field predicts paths, so that its weight is one without evidence instead of zero.
     """
-    bound = functools.partial(lower_bound, group=group, errors=ERRORS_WITH_PATHS if with_paths else ERRORS)
+    errors = ERRORS_WITH_PATHS if with_paths else ERRORS
+
+    def bound(gains: Float[np.ndarray, " n"], change: float) -> float:
+        return lower_bound(gains, group, USUAL_SPREAD * change, errors)
+
     default = -1 if with_paths else 0
     best, found = 0.0, (30.0 if with_paths else -30.0, 0.0)
     slopes = (0.0, -1.0, 1.0)  # slopes of the logit of the field's weight that are tried
@@ -369,26 +372,13 @@ def choose_share(
         for middle in np.delete(SHARES, default):
             bias = float(logit(np.clip(middle, 1e-4, 1 - 1e-4)))
             share = expit(bias + slope * u) if slope else np.full(len(u), middle)
-            worth = bound(_at(scores, share) - scores[:, default], share=float(np.abs(share - SHARES[default]).mean()))
+            worth = bound(_at(scores, share) - scores[:, default], float(np.abs(share - SHARES[default]).mean()))
             if worth > best + (least_gain if slope and not found[1] else 0):
                 best, found = worth, (bias, slope)
     chosen = expit(found[0] + found[1] * u)
-    proven = with_paths or bound(scores[:, -1] - scores[:, 0], share=1.0) > 0
+    proven = with_paths or bound(scores[:, -1] - scores[:, 0], 1.0) > 0
     gain, _ = standard_error(_at(scores, chosen) - scores[:, -1], group)
     return found, bool(proven and gain < least_gain)
-
-
-def lower_bound(gains: Float[np.ndarray, " n"], share: float, group: Int[np.ndarray, " n"], errors: float = ERRORS) -> float:
-    """Returns the lower confidence bound of the mean gain over groups of a change of the field's weight by `share`. Their
-    variance combines the observed one with a prior that counts as two groups, so that a few groups that happen to agree are
-    little evidence."""
-    by_group = by_transmitter(gains, group)
-    n = len(by_group)
-    # Prior standard deviation over transmitters of the gain of a field (SSIM), and the number of transmitters it counts as.
-    usual_spread, usual_weight = 0.1, 2.0
-    usual = (usual_spread * share) ** 2
-    variance = (usual_weight * usual + np.sum((by_group - by_group.mean()) ** 2)) / (usual_weight + n - 1)
-    return float(by_group.mean() - errors * np.sqrt(variance / n))
 
 
 def _at(scores: Float[np.ndarray, "n shares"], share: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -25,7 +25,7 @@ from wbgs_jax.training.calibration.alignment import Place, learn_geometry
 from wbgs_jax.training.calibration.antennas import search_antennas, search_pair
 from wbgs_jax.training.calibration.array_gains import search_tuning
 from wbgs_jax.training.calibration.material_fit import entries_of, search_materials, unknown_mm
-from wbgs_jax.training.calibration.objective import CalibrationProblem, Scores
+from wbgs_jax.training.calibration.objective import CalibrationProblem, Scores, comparable
 from wbgs_jax.training.calibration.obstacles import search_absent, search_clutter
 from wbgs_jax.training.calibration.propagation_options import search_idealisations
 from wbgs_jax.training.calibration.thickness import search_slabs
@@ -99,6 +99,10 @@ class Calibration(Hook):
                 params, gain = search_gain(params, problem.scores(config.spectra))
                 report["search"] = dataclasses.asdict(named)
             return Edit(params, (), None, report | {"gain_db": gain}, field, prepared)
+        one_element = comparable("snapshots", data) == "powers"  # of which everything is learned by the level
+        if one_element:
+            say("calibration: gain")
+            params, _ = search_gain(params, problem.scores(config.spectra), unusual_level(problem))
         if config.antenna_rounds:
             say("calibration: antenna patterns")
             params, _ = self._antennas(params, problem, report)
@@ -141,7 +145,8 @@ class Calibration(Hook):
             params, field = self._clutter(params, problem, report, rng, say)
             thick = unknown_mm(params.materials, np.asarray(problem.field.known_thickness))
             report["search"] |= {"taken": entries_of(params.materials), "thickness_mm": thick}  # materials may have changed
-        if data.snapshots is not None and (level := unusual_level(problem)):
+        level = 0.0 if data.snapshots is None else unusual_level(problem)
+        if level or one_element:
             problem = dataclasses.replace(problem, field=field)  # which may have an absorption grid now
             params, report["gain_db"] = search_gain(params, problem.scores(config.position_std_spectra, "powers"), level)
         return Edit(params, (), None, report, field, prepared)
