@@ -14,9 +14,10 @@ from PIL import Image
 from wbgs_jax.applications.antenna_placement import power_at_users
 from wbgs_jax.commands import map as map_command
 from wbgs_jax.commands import predict as predict_command
-from wbgs_jax.inference.evaluate_quantities import domain_of
+from wbgs_jax.inference import radio_map
+from wbgs_jax.inference.evaluate_quantities import LoadedField, domain_of
 from wbgs_jax.inference.intervals import PowerConfidence, write_confidence
-from wbgs_jax.inference.quantities import QUANTITIES
+from wbgs_jax.inference.quantities import QUANTITIES, Network
 from wbgs_jax.inference.radio_map import cut_at, pieces, plane_over
 from wbgs_jax.radio.array import codebook
 from wbgs_jax.radio.network import noise_dbm, sinr_db, throughput_bps
@@ -147,7 +148,7 @@ def test_maps_of_several_transmitters_are_those_of_each(runs, tmp_path):
     found = dict(np.load(out))
     assert found["received_dbm"].shape == (2, 2, 2, 4) and found["sinr_db"].shape == (2, 2, 4)
     each, meta = np.moveaxis(found["received_dbm"], 0, -1), json.loads(str(found["meta"]))
-    ratios = np.asarray(sinr_db(jnp.asarray(each), noise_dbm(400e6, 7.0), 0.5)).max(-1)
+    ratios = np.asarray(sinr_db(jnp.asarray(each), noise_dbm(400e6, 7.0), 0.5)).max(-1)  # of the best server: equal loads
     np.testing.assert_allclose(found["sinr_db"], ratios, atol=1e-3)
     np.testing.assert_array_equal(found["best_server"], each.argmax(-1))
     np.testing.assert_array_equal(found["rsrp_dbm"], each.max(-1))
@@ -161,6 +162,24 @@ def test_maps_of_several_transmitters_are_those_of_each(runs, tmp_path):
     for picture in pictures:
         with Image.open(picture) as image:
             assert np.asarray(image.convert("L")).std() > 10
+
+
+def test_sinr_and_throughput_are_those_of_the_best_server(monkeypatch):
+    """Not of the second transmitter, whose ratio is larger because it alone interferes."""
+    powers = iter((-50.0, -51.0))
+    monkeypatch.setattr(
+        radio_map, "evaluate_plane", lambda *_: {"power_db": np.full((1, 1, 1), next(powers))} | dict.fromkeys(SHARED, 0)
+    )
+    plane, hertz = plane_over(np.zeros(2), np.ones(2), 1.0, 1.0), np.array([28e9])
+    fields = [object.__new__(LoadedField)] * 2
+    found = radio_map.evaluate_network(fields, plane, hertz, Network((0.0,), (0.0, 1.0), 1e6, 0.0))
+    ratio = sinr_db([-50.0, -51.0], noise_dbm(1e6), [0.0, 1.0])[0]
+    assert found["best_server"] == 0 and found["rsrp_dbm"] == -50
+    np.testing.assert_allclose(found["sinr_db"].item(), ratio, atol=1e-4)
+    np.testing.assert_allclose(found["throughput_bps"].item(), throughput_bps(ratio, 1e6), rtol=1e-4)
+
+
+SHARED = ("xs", "ys", "height", "frequencies_hz")
 
 
 @pytest.mark.parametrize(
@@ -191,6 +210,11 @@ def test_maps_of_several_transmitters_are_those_of_each(runs, tmp_path):
         ("wave", ["--ghz", "28", "--step", "1e-4", "--out", "OUT/a.npz"], ["1,000,000 positions"]),
         ("wave", ["--ghz", "28", "--height", "nan", "--out", "OUT/a.npz"], ["--height nan"]),
         ("wave", ["--ghz", "28", "--area", "0,0:0,1", "--out", "OUT/a.npz"], ["--area 0,0:0,1 is not a rectangle"]),
+        (
+            "wave",
+            ["--ghz", "28", "--what", "rsrp", "--tx", "0,2001,1", "--out", "OUT/a.npz"],
+            ["each at most 2000"],
+        ),
         ("wave", ["--ghz", "28", "--area", "0,0:x,1", "--out", "OUT/a.npz"], ["is not a rectangle"]),
         ("wideband", ["--ghz", "28", "--what", "k-factor", "--out", "OUT/a.npz"], ["not provide k-factor", "wave"]),
         ("wideband", ["--ghz", "0.5", "--out", "OUT/a.npz"], ["from 1 GHz upwards"]),

@@ -99,8 +99,9 @@ def evaluate_network(
     received = np.stack([one["power_db"] for one in maps]) + power
     noise = noise_dbm(network.bandwidth_hz, network.noise_figure_db)
     each = jnp.moveaxis(jnp.asarray(received, jnp.float32), 0, -1)
-    best = jnp.max(sinr_db(each, noise, jnp.asarray(network.load, jnp.float32)), -1)
     server, strongest = np.argmax(received, 0), received.max(0)
+    ratios = sinr_db(each, noise, jnp.asarray(network.load, jnp.float32))
+    best = jnp.take_along_axis(ratios, server[..., None], -1)[..., 0]  # with unequal loads, others may have larger ones
     found = {"rsrp_dbm": strongest, "sinr_db": best, "best_server": server}
     found |= {"throughput_bps": throughput_bps(best, network.bandwidth_hz), "received_dbm": received}
     shared = {name: maps[0][name] for name in ("xs", "ys", "height", "frequencies_hz")}
