@@ -502,7 +502,8 @@ def draw_maps(what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray,
         if i >= len(values):
             axis.axis("off")
             continue
-        shown = axis.imshow(values[i], extent=extent, origin="lower", cmap=colors, aspect="equal", **span)
+        finite = np.minimum(values[i], span["vmax"])  # infinite K-factors of single paths have the colour of the largest
+        shown = axis.imshow(finite, extent=extent, origin="lower", cmap=colors, aspect="equal", **span)
         axis.add_collection(LineCollection(list(walls), colors="black", linewidths=0.8))
         axis.plot(*stars[:, :2].T, **STAR | {"label": "transmitters" if network else "receiver"})
         axis.set(xlim=extent[:2], ylim=extent[2:])
@@ -524,9 +525,9 @@ def draw_distribution(what: str, answer: dict[str, np.ndarray]) -> Figure:
     figure = Figure(figsize=(7, 4), layout="constrained")
     axis = figure.subplots()
     for values, frequency in zip(_drawn(quantity, answer), answer["frequencies_hz"], strict=True):
-        placed = np.sort(values[~answer["no_confidence"]])  # NaN last
-        known = placed[np.isfinite(placed)]
-        share = (len(placed) - len(known) + 1 + np.arange(len(known))) / max(len(placed), 1)
+        placed = np.sort(values[~answer["no_confidence"]])  # infinite ones behind all finite ones, NaN last
+        known, lower = placed[np.isfinite(placed)], np.isnan(placed).sum()
+        share = (lower + 1 + np.arange(len(known))) / max(len(placed), 1)
         axis.step(known, share, where="post", label=f"{frequency / 1e9:g} GHz")
     axis.set(xlabel=quantity.label, ylabel="share of the positions", ylim=(0, 1))
     axis.grid(alpha=0.3)
@@ -549,7 +550,8 @@ def _drawn(quantity: Quantity, answer: dict[str, np.ndarray]) -> Float[np.ndarra
 
 def _span(values: Float[np.ndarray, "freq ny nx"]) -> dict[str, Any]:
     """Returns colour limits that exclude the lowest and the highest hundredth of the values."""
-    low, high = np.nanquantile(values, [0.01, 0.99]) if np.isfinite(values).any() else (0.0, 1.0)
+    finite = values[np.isfinite(values)]
+    low, high = np.quantile(finite, [0.01, 0.99]) if finite.size else (0.0, 1.0)
     return {"vmin": float(low), "vmax": float(high)}
 
 

@@ -16,6 +16,7 @@ from wbgs_jax.metrics import score
 from wbgs_jax.plotting import (
     draw_all,
     draw_curves,
+    draw_distribution,
     draw_frequencies,
     draw_maps,
     draw_motion,
@@ -244,13 +245,23 @@ def test_errors_have_a_scale_of_their_own(dataset):
     assert [axis.images[0].get_clim()[1] for axis in figure.axes[:3]] == pytest.approx([1, 1, 0.01], rel=1e-4)
 
 
-@pytest.mark.parametrize(("outlier", "extend"), [(None, "neither"), (50.0, "max"), (-50.0, "min")])
+def test_the_distribution_counts_links_without_paths_as_lower_and_single_paths_as_higher():
+    answer = {"k_factor_db": np.array([[[np.nan, 3.0], [np.inf, 1.0]]]), "frequencies_hz": HERTZ[:1]}
+    (curve,) = draw_distribution("k-factor", answer | {"no_confidence": np.zeros((2, 2), bool)}).axes[0].lines
+    np.testing.assert_allclose(curve.get_xydata(), [[1, 0.5], [3, 0.75]])
+
+
+@pytest.mark.parametrize(
+    ("outlier", "extend"), [(None, "neither"), (50.0, "max"), (-50.0, "min"), (np.inf, "max"), (np.nan, "neither")]
+)
 def test_a_colour_bar_has_an_arrow_where_it_saturates(outlier, extend):
     values = np.zeros((1, 20, 20))
     if outlier:
         values[0, 0, 0] = outlier
     answer = {"k_factor_db": values, "xs": np.arange(20.0), "ys": np.arange(20.0), "height": 1.5, "frequencies_hz": HERTZ[:1]}
     figure = draw_maps("k-factor", answer, WALLS, SOURCE)
-    assert figure.axes[0].images[0].colorbar.extend == extend
+    image = figure.axes[0].images[0]
+    assert image.colorbar.extend == extend and np.isfinite(image.get_clim()).all()
+    assert (~np.isfinite(image.get_array().filled(np.nan))).sum() == (outlier is not None and np.isnan(outlier))
     assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ["receiver"]
     assert "box, wave field" in figure.get_suptitle()

@@ -226,7 +226,7 @@ def _beamforming_gain(arrivals: Paths, receiver: Receiver, frequency_hz: Any) ->
     y = snapshots_from_paths(arrivals, receiver, frequency_hz)
     directions = jnp.asarray(pas_directions(), jnp.float32)
     strongest = jnp.max(cbf(y, steering_vector(receiver.element_wavelengths(frequency_hz), directions)))
-    return channel.beamforming_gain_db(y, strongest)
+    return jnp.where(strongest > 0, channel.beamforming_gain_db(y, strongest), jnp.nan)  # NaN without any path
 
 
 def _k_factor(arrivals: Paths, *_: Any) -> Array:
