@@ -34,9 +34,36 @@ def test_two_paths():
 
 
 def test_one_path_and_none():
-    assert k_factor_db(arrivals([[1e-6, 0]], [[3, 4]])) > 150
-    assert delay_spread_s(arrivals([[0.0, 0.0]], [[3, 4]])) == 0
-    np.testing.assert_array_equal(channel.angular_spread_deg(arrivals([0.0, 0.0], [3, 4])), 0)
+    one, none = arrivals([[1e-6, 0]], [[3, 4]]), arrivals([[0.0, 0.0]], [[3, 4]])
+    assert k_factor_db(one) == np.inf and np.isnan(k_factor_db(none)).all()
+    assert delay_spread_s(one) == 0 and np.isnan(delay_spread_s(none)).all()
+    ahead = jnp.broadcast_to(jnp.array([1.0, 0, 0]), (1, 2, 3))
+    assert (channel.angular_spread_deg(one._replace(direction=ahead)) == 0).all()
+    assert np.isnan(channel.angular_spread_deg(none)).all()
+
+
+@pytest.mark.parametrize("function", [channel.k_factor_db, channel.delay_spread_s, channel.angular_spread_deg])
+def test_gradients_of_links_with_a_few_paths_are_finite(function):
+    """Also of links with one path, in the same batch."""
+    found = arrivals([[1.0, 0.5, 0.0], [1.0, 0.0, 0.0]], [[3, 4, 5], [3, 4, 5]])
+    found = found._replace(direction=jnp.broadcast_to(jnp.eye(3), (2, 3, 3)))
+
+    def total(gain, metres, direction):
+        values = function(found._replace(amplitude=gain * found.amplitude, length=metres, direction=direction))
+        return jnp.sum(jnp.where(jnp.isfinite(values), values, 0))
+
+    for slope in jax.grad(total, (0, 1, 2))(jnp.ones((2, 3)), found.length, found.direction):
+        assert np.isfinite(slope).all()
+
+
+def test_python_numbers_and_lists_are_taken():
+    assert float(channel.received_power_db([1e-3 + 0j, 1e-3])) == pytest.approx(-60, abs=1e-4)
+    np.testing.assert_allclose(channel.free_space_db([0.0, 10.0], 2.4e9), [np.inf, -60.05], atol=0.01)
+    assert channel.free_space_db(0, 2.4e9) == np.inf
+    assert float(channel.correlation([1 + 0j, 1j], [1j, -1])) == pytest.approx(1, abs=1e-6)
+    paths = arrivals([1.0, 0.5], [3.0, 4.0])
+    np.testing.assert_allclose(paths.cfr(0.0), [1.5], atol=1e-6)
+    np.testing.assert_array_equal(paths.cfr([0.0, 1e6]), paths.cfr(jnp.array([0.0, 1e6])))
 
 
 def test_correlation_is_blind_to_phase_and_scale(rng):

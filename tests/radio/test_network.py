@@ -7,7 +7,7 @@ import pytest
 from builders.mirrors import trained
 from builders.rooms import METAL, field_of, rectangle
 
-from wbgs_jax.applications.antenna_placement import power_at_users, tenth_percentile
+from wbgs_jax.applications.antenna_placement import mean_power, power_at_users, soft_minimum, tenth_percentile
 from wbgs_jax.applications.array_orientation import boresight_quaternion
 from wbgs_jax.radio.antenna import Antenna, pattern_exponents
 from wbgs_jax.radio.network import BOLTZMANN, noise_dbm, sinr_db, throughput_bps
@@ -56,6 +56,15 @@ def test_throughput_is_the_bound_of_shannon():
     ratios = np.array([-60.0, 0.0, 30.0])
     found = throughput_bps(jnp.asarray(ratios, jnp.float32), 20e6)
     np.testing.assert_allclose(found, 20e6 * np.log2(1 + 10 ** (ratios / 10)), rtol=1e-5)
+
+
+def test_lists_of_powers_are_taken():
+    powers, arrays = [-60, -90], jnp.array([-60.0, -90.0])
+    np.testing.assert_array_equal(sinr_db(powers, -100.0, [1, 0]), sinr_db(arrays, -100.0, jnp.array([1.0, 0.0])))
+    np.testing.assert_array_equal(throughput_bps([0, 10], 20e6), throughput_bps(jnp.array([0.0, 10.0]), 20e6))
+    assert float(throughput_bps(0, 20e6)) == pytest.approx(20e6)
+    for objective in (soft_minimum, mean_power, tenth_percentile):
+        np.testing.assert_allclose(objective(powers), objective(arrays), rtol=1e-6)
 
 
 def worst_tenth(received_dbm):

@@ -32,12 +32,12 @@ NARROWEST_M = 0.02
 """Final smoothing length, metres: variations over a few millimetres are fading, which does not matter for coverage."""
 
 
-def soft_minimum(power_db: Float[Array, "*k users"], soft_db: float = SOFT_DB) -> Float[Array, "*k"]:
+def soft_minimum(power_db: Any, soft_db: float = SOFT_DB) -> Float[Array, "*k"]:
     """Returns a smooth minimum over the users, between the lowest power and the mean of the decibels; it approaches the mean as
     `soft_db` grows.
 
     Args:
-        power_db: powers of the users.
+        power_db: (*k, users), powers of the users.
         soft_db: width of the transition, decibels.
 
     Returns:
@@ -48,31 +48,32 @@ def soft_minimum(power_db: Float[Array, "*k users"], soft_db: float = SOFT_DB) -
         >>> round(float(soft_minimum(jnp.array([-60.0, -90.0]), 1.0)), 1)
         -89.3
     """
+    power_db = jnp.asarray(power_db)
     return -soft_db * (jax.nn.logsumexp(-power_db / soft_db, -1) - jnp.log(power_db.shape[-1]))
 
 
-def mean_power(power_db: Float[Array, "*k users"]) -> Float[Array, "*k"]:
+def mean_power(power_db: Any) -> Float[Array, "*k"]:
     """Returns the mean over the users of their powers in dB.
 
     Args:
-        power_db: powers of the users.
+        power_db: (*k, users), powers of the users.
 
     Returns:
         Decibels (*k,).
     """
-    return jnp.mean(power_db, -1)
+    return jnp.mean(jnp.asarray(power_db), -1)
 
 
-def tenth_percentile(power_db: Float[Array, "*k users"]) -> Float[Array, "*k"]:
+def tenth_percentile(power_db: Any) -> Float[Array, "*k"]:
     """Returns the power that nine of ten users exceed; its gradient is that of the two adjacent users.
 
     Args:
-        power_db: powers of the users.
+        power_db: (*k, users), powers of the users.
 
     Returns:
         Decibels (*k,).
     """
-    return jnp.quantile(power_db, 0.1, axis=-1)
+    return jnp.quantile(jnp.asarray(power_db), 0.1, axis=-1)
 
 
 def power_at_users(field: Field, params: Params, users: Any, frequencies_hz: Any) -> Powers:

@@ -4,7 +4,7 @@ All functions are pure. A `snapshot` holds the complex voltages of the receiver'
 geometry of all paths. Leading axes are batch axes.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -59,15 +59,13 @@ class Paths(NamedTuple):
             tau = tau - jnp.where(jnp.isfinite(first), first, 0)
         return amplitude, jnp.where(valid, tau, -1)
 
-    def cfr(
-        self, frequencies_hz: Float[Array, " f"], normalize_delays: bool = True, normalize: bool = False
-    ) -> Complex[Array, "*b f"]:
+    def cfr(self, frequencies_hz: Any, normalize_delays: bool = True, normalize: bool = False) -> Complex[Array, "*b f"]:
         """Returns the frequency response in complex baseband: sum over k of a_k exp(-2 pi j f tau_k).
 
         The amplitudes are those at the carrier: over a band in which materials change, query the field at every frequency.
 
         Args:
-            frequencies_hz: relative to the carrier, such as those of OFDM subcarriers.
+            frequencies_hz: (f,) or one, relative to the carrier, such as those of OFDM subcarriers.
             normalize_delays: whether the delays of every link are counted from its first path.
             normalize: whether the mean of |H|^2 over the frequencies is 1 for every link (links without paths stay 0).
 
@@ -81,7 +79,7 @@ class Paths(NamedTuple):
             [1.5, 0.5]
         """
         a, tau = self.cir(normalize_delays)
-        cycles = jnp.asarray(frequencies_hz, tau.dtype)[:, None] * tau[..., None, :]
+        cycles = jnp.atleast_1d(jnp.asarray(frequencies_hz, tau.dtype))[:, None] * tau[..., None, :]
         response = jnp.sum(a[..., None, :] * jnp.exp(-2j * jnp.pi * (cycles - jnp.round(cycles))), -1)
         return _with_energy(response, response.shape[-1]) if normalize else response
 
@@ -140,34 +138,34 @@ def decibels(power: Float[Array, "*b"]) -> Float[Array, "*b"]:
     return 10 * jnp.log10(jnp.maximum(power, SMALLEST))
 
 
-def received_power_db(snapshot: Complex[Array, "*b elements"]) -> Float[Array, "*b"]:
+def received_power_db(snapshot: Any) -> Float[Array, "*b"]:
     """Returns the mean received power per element relative to the transmitted power (dB), the negative path loss.
 
     Args:
-        snapshot: complex voltages of the elements, relative to the transmitted amplitude.
+        snapshot: (*b, elements), complex voltages of the elements, relative to the transmitted amplitude.
 
     Returns:
         Decibels (*b,).
     """
-    return decibels(jnp.mean(squared_magnitude(snapshot), -1))
+    return decibels(jnp.mean(squared_magnitude(jnp.asarray(snapshot)), -1))
 
 
-def free_space_db(distance: Float[Array, "*b"], frequency_hz: Float[Array, "*b"]) -> Float[Array, "*b"]:
+def free_space_db(distance: Any, frequency_hz: Float[Array, "*b"] | float) -> Float[Array, "*b"]:
     """Returns the power received by an isotropic element over a free line of sight, relative to the transmitted power (dB;
     Friis).
 
     Args:
-        distance: metres.
+        distance: (*b,), metres.
         frequency_hz: of the carrier.
 
     Returns:
-        Decibels (*b,), negative beyond a tenth of a wavelength.
+        Decibels (*b,), negative beyond a tenth of a wavelength; infinite at distance 0.
 
     Example:
         >>> round(float(free_space_db(jnp.array(10.0), jnp.array(2.4e9))), 1)
         -60.1
     """
-    return 20 * jnp.log10(SPEED_OF_LIGHT / (4 * jnp.pi * frequency_hz * distance))
+    return 20 * jnp.log10(SPEED_OF_LIGHT / (4 * jnp.pi * frequency_hz * jnp.asarray(distance)))
 
 
 def beyond_free_space_db(
@@ -205,11 +203,14 @@ def k_factor_db(arrivals: Paths) -> Float[Array, "*b"]:
         arrivals: paths.
 
     Returns:
-        Decibels (*b,).
+        Decibels (*b,); infinite with a single path, NaN without any.
     """
     power = squared_magnitude(arrivals.amplitude)
-    strongest = jnp.max(power, -1)
-    return decibels(strongest / jnp.maximum(jnp.sum(power, -1) - strongest, SMALLEST))
+    strongest, largest = jnp.max(power, -1), jnp.argmax(power, -1, keepdims=True)
+    others = jnp.sum(jnp.where(jnp.arange(power.shape[-1]) == largest, 0, power), -1)
+    several = others > 0
+    ratio = decibels(strongest / jnp.where(several, others, 1))
+    return jnp.where(several, ratio, jnp.where(strongest > 0, jnp.inf, jnp.nan))
 
 
 def delay_spread_s(arrivals: Paths) -> Float[Array, "*b"]:
@@ -219,24 +220,27 @@ def delay_spread_s(arrivals: Paths) -> Float[Array, "*b"]:
         arrivals: paths.
 
     Returns:
-        Seconds (*b,); 0 with a single path.
+        Seconds (*b,); 0 with a single path, NaN without any.
     """
     power = squared_magnitude(arrivals.amplitude)
-    weight = power / jnp.maximum(jnp.sum(power, -1, keepdims=True), SMALLEST)
+    total = jnp.sum(power, -1, keepdims=True)
+    weight = power / jnp.maximum(total, SMALLEST)
     delay = arrivals.length / SPEED_OF_LIGHT
     mean = jnp.sum(weight * delay, -1, keepdims=True)
-    return jnp.sqrt(jnp.sum(weight * (delay - mean) ** 2, -1))
+    variance = jnp.sum(weight * (delay - mean) ** 2, -1)
+    spread = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1)), 0)  # the root has no slope at 0
+    return jnp.where(total[..., 0] > 0, spread, jnp.nan)
 
 
 def angular_spread_deg(arrivals: Paths) -> Float[Array, "*b 2"]:
     """Returns the power-weighted circular spreads of azimuth and zenith of arrival (in this order) in the receiver's frame,
-    degrees (3GPP TR 38.901, annex A); 0 without any path.
+    degrees (3GPP TR 38.901, annex A).
 
     Args:
         arrivals: paths.
 
     Returns:
-        Azimuth and zenith spread (*b, 2), degrees.
+        Azimuth and zenith spread (*b, 2), degrees; NaN without any path.
     """
     power = squared_magnitude(arrivals.amplitude)
     total = jnp.sum(power, -1, keepdims=True)
@@ -245,8 +249,9 @@ def angular_spread_deg(arrivals: Paths) -> Float[Array, "*b 2"]:
     level = jnp.sqrt(jnp.maximum(x * x + y * y, SMALLEST))
     unit = jnp.stack([jnp.stack([x / level, y / level], -1), jnp.stack([z, level], -1)], -3)  # (*b, 2, k, 2)
     mean = jnp.sum(weight[..., None, :, None] * unit, -2)
-    length = jnp.clip(jnp.sum(mean**2, -1), SMALLEST, 1.0)
-    return jnp.where(total > 0, jnp.degrees(jnp.sqrt(-jnp.log(length))), 0.0)
+    length = jnp.maximum(jnp.sum(mean**2, -1), SMALLEST)
+    spread = jnp.where(length < 1, jnp.degrees(jnp.sqrt(-jnp.log(jnp.where(length < 1, length, 0.5)))), 0)  # as above
+    return jnp.where(total > 0, spread, jnp.nan)
 
 
 def doppler_hz(
@@ -277,17 +282,17 @@ def unit_snapshots(
     return snapshots / jnp.where(norm > 0, norm, 1), norm
 
 
-def correlation(a: Complex[Array, "*b elements"], b: Complex[Array, "*b elements"]) -> Float[Array, "*b"]:
+def correlation(a: Any, b: Any) -> Float[Array, "*b"]:
     """Returns |a^H b| / (|a| |b|): 1 for snapshots that are equal up to a common phase and scale; 0 for a zero snapshot.
 
     Args:
-        a, b: complex voltages of the same elements.
+        a, b: (*b, elements), complex voltages of the same elements.
 
     Returns:
         Values (*b,) from 0 to 1.
     """
     # Computed from unit vectors: the squared product of weak snapshots would underflow in single precision.
-    (unit_a, _), (unit_b, _) = unit_snapshots(a), unit_snapshots(b)
+    (unit_a, _), (unit_b, _) = (unit_snapshots(jnp.asarray(one)) for one in (a, b))
     return jnp.sqrt(squared_magnitude(jnp.sum(unit_a.conj() * unit_b, -1)))
 
 

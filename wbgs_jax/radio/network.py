@@ -5,6 +5,8 @@ frequencies or places. Definitions are those of Sionna RT's `RadioMap`: the rece
 `rss`, and the SINR its `sinr`, with the noise of a temperature and a bandwidth.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -37,17 +39,17 @@ def noise_dbm(
 
 
 def sinr_db(
-    received_dbm: Float[Array, "*b tx"],
+    received_dbm: Any,
     noise_dbm: Float[Array, "*#b"] | float,
-    load: Float[Array, "#tx"] | float = 1.0,
+    load: Any = 1.0,
 ) -> Float[Array, "*b tx"]:
     """Returns the signal-to-interference-and-noise ratio of a receiver that is served by each of the transmitters, while all
     others interfere.
 
     Args:
-        received_dbm: power received from every transmitter.
+        received_dbm: (*b, tx), power received from every transmitter.
         noise_dbm: power of the noise (`noise_dbm`).
-        load: mean activity of the transmitters as interferers, 0 to 1, one each or one for all.
+        load: (tx,) or one, mean activity of the transmitters as interferers, 0 to 1.
 
     Returns:
         Decibels (*b, tx). The best server is `jnp.argmax(received_dbm, -1)`.
@@ -57,6 +59,7 @@ def sinr_db(
         >>> [round(float(ratio), 2) for ratio in sinr_db(jnp.array([-60.0, -60.0]), -60.0)]  # twice the power interferes
         [-3.01, -3.01]
     """
+    received_dbm, load = jnp.asarray(received_dbm), jnp.asarray(load)
     # Relative to the strongest, so that squares of faint amplitudes do not underflow; of the others only, since the difference
     # of a sum and its largest term is lost in rounding.
     strongest = jnp.max(received_dbm, -1, keepdims=True)
@@ -67,11 +70,11 @@ def sinr_db(
     return received_dbm - strongest - 10 * jnp.log10(interference + noise)
 
 
-def throughput_bps(sinr_db: Float[Array, "*b"], bandwidth_hz: Float[Array, "*b"] | float) -> Float[Array, "*b"]:
+def throughput_bps(sinr_db: Any, bandwidth_hz: Float[Array, "*b"] | float) -> Float[Array, "*b"]:
     """Returns the largest rate without errors, B log2(1 + SINR) (Shannon 1948).
 
     Args:
-        sinr_db: signal-to-interference-and-noise ratio, decibels.
+        sinr_db: (*b,), signal-to-interference-and-noise ratio, decibels.
         bandwidth_hz: bandwidth B.
 
     Returns:
@@ -81,4 +84,4 @@ def throughput_bps(sinr_db: Float[Array, "*b"], bandwidth_hz: Float[Array, "*b"]
         >>> round(float(throughput_bps(jnp.array(0.0), 100e6)) / 1e6)
         100
     """
-    return bandwidth_hz * jnp.log1p(10 ** (sinr_db / 10)) / jnp.log(2)
+    return bandwidth_hz * jnp.log1p(10 ** (jnp.asarray(sinr_db) / 10)) / jnp.log(2)
