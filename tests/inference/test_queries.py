@@ -42,6 +42,10 @@ def test_a_file_of_queries(tmp_path):
         ('x,y,z,ghz\n"1,2,3,28\n' + "1,2,3,28\n" * 20_000, ["is not CSV", "check its quotation marks"]),
         ("x,y,z,ghz\n1,2,nan,28\n", ["line 2"]),
         ("x,y,z,ghz\n1,2,3e9,28\n", ["is not a position"]),
+        ("x,y,z,ghz\n1,2,2001,28\n", ["is not a position", "at most 2000"]),
+        ("x,y,z,ghz\n1_0,2,3,28\n", ["line 2", "lacks a number"]),
+        ("x;y;z;ghz\n1,0;2,0;3,0;28,0\n", ["separated by semicolons; write commas", "decimal points"]),
+        ("x\ty\tz\tghz\n1\t2\t3\t28\n", ["separated by tabs"]),
     ],
 )
 def test_files_that_are_refused(tmp_path, text, words):
@@ -53,6 +57,14 @@ def test_files_that_are_refused(tmp_path, text, words):
         assert word in str(error.value)
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be"])
+def test_a_file_in_utf_16_is_named(tmp_path, encoding):
+    path = tmp_path / "queries.csv"
+    path.write_bytes(("\ufeff" * (encoding == "utf-16-be") + "x,y,z,ghz\n1,2,3,28\n").encode(encoding))
+    with pytest.raises(UserError, match="is in UTF-16; save it as text in UTF-8"):
+        read_queries(path)
+
+
 @pytest.mark.parametrize(
     ("parse", "word"),
     [
@@ -60,6 +72,9 @@ def test_files_that_are_refused(tmp_path, text, words):
         (parse_line, "0,0,1:4,0,1:0"),
         (parse_line, "0,0:4,0,1:5"),
         (parse_line, "0,0,1:4,0,1:9999999"),
+        (parse_line, "0,0,1:2001,0,1:5"),
+        (parse_line, "0,0,1:4_0,0,1:5"),
+        (parse_grid, "0,0,1:2001,0,1:5x5x1"),
         (parse_grid, "0,0,1:4,0,1:5"),
         (parse_grid, "0,0,1:4,0,1:5x5xtwo"),
         (parse_grid, "0,0,1:4,0,1:5000x5000x1"),
@@ -67,6 +82,7 @@ def test_files_that_are_refused(tmp_path, text, words):
         (parse_sweep, "0:100:5"),
         (parse_sweep, "a:b:5"),
         (parse_sweep, "nan:100:5"),
+        (parse_sweep, "1:1_0:5"),
     ],
 )
 def test_words_that_are_refused(parse, word):

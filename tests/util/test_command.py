@@ -3,11 +3,13 @@
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 from builders.commands import assert_error_for_people, call
 
-from wbgs_jax._util.cli import option_value, run_command, say
+from wbgs_jax._util.cli import option_value, parse_vector, run_command, say
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.types import LARGEST_COORDINATE_M
 
 
 @pytest.mark.parametrize(
@@ -37,6 +39,19 @@ def test_warnings_are_notes(monkeypatch):
     run_command(lambda: None)
     assert warnings.formatwarning("the mesh was simplified", UserWarning, "mesh.py", 3) == "note: the mesh was simplified\n"
     assert "mesh.py:3" in warnings.formatwarning("soon gone", DeprecationWarning, "mesh.py", 3)
+
+
+def test_positions_are_limited_as_coordinates_of_data_and_velocities_by_themselves():
+    np.testing.assert_array_equal(parse_vector("0,-2000,3e1", "--tx", "position", "metres"), [0, -LARGEST_COORDINATE_M, 30])
+    assert parse_vector("0,7500,0", "--tx-velocity")[1] == 7500
+    for word, kind in (
+        ("0,2001,0", "position"),
+        ("0,2001,0", "displacement"),
+        ("0,2e5,0", "velocity"),
+        ("1_0,0,0", "position"),
+    ):
+        with pytest.raises(UserError, match=f"--tx {word} is not a {kind}"):
+            parse_vector(word, "--tx", kind, "metres")
 
 
 def test_lines_for_people_leave_stdout_alone(capsys):

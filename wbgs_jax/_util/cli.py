@@ -79,16 +79,24 @@ def parse_vector(word: str, option: str, kind: str = "velocity", unit: str = "me
         UserError: the string is not of this form, or a number is too large.
     """
     values = parse_numbers(word)
-    furthest = 1e5  # metres, or metres per second: larger values are mistakes, and soon exceed single precision
+    # Metres per second, or metres (`types.LARGEST_COORDINATE_M`, whose module loads JAX): larger values are mistakes.
+    furthest = 1e5 if kind == "velocity" else 2e3
     if len(values) != 3 or not (np.abs(values) <= furthest).all():
         raise UserError(f"{option} {word[:60]} is not a {kind}; give x,y,z in {unit}, each at most {furthest:g}")
     return values
 
 
+def parse_number(word: str) -> float:
+    """Returns a number; anything else is a `ValueError`, also 1_0, which Python reads as 10."""
+    if "_" in word:
+        raise ValueError(f"{word!r} has an underscore")
+    return float(word)
+
+
 def parse_numbers(word: str) -> Float[np.ndarray, " n"]:
     """Returns the numbers of a string "a,b,...", none if it is not of this form."""
     try:
-        return np.array([float(part) for part in word.split(",")])
+        return np.array([parse_number(part) for part in word.split(",")])
     except ValueError:
         return np.zeros(0)
 

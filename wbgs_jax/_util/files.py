@@ -11,6 +11,7 @@ YAML files are small and written by hand. Anything but plain data is rejected, s
 deep nesting.
 """
 
+import codecs
 import contextlib
 import csv
 import dataclasses
@@ -117,6 +118,8 @@ def read_text(path: Path) -> str:
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}; the folder must contain it") from error
     except UnicodeDecodeError as error:
+        if error.object[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+            raise UserError(f"{path} is in UTF-16; save it as text in UTF-8") from error
         raise UserError(f"{path} is not a text file ({error.reason}); copy it again") from error
 
 
@@ -134,6 +137,9 @@ def read_csv(path: Path) -> tuple[list[str], Iterator[tuple[int, list[str]]]]:
     """
     rows = _csv_rows(path)
     names = [name.lower() for name in next(rows, (1, []))[1]]
+    for sign, word in ((";", "semicolons"), ("\t", "tabs")):
+        if len(names) == 1 and sign in names[0]:
+            raise UserError(f"the columns of {path} are separated by {word}; write commas, and decimal points in numbers")
     if twice := [name for name in names if name and names.count(name) > 1]:
         raise UserError(f"{path} has two columns {twice[0]!r}; name every column once")
     return names, rows

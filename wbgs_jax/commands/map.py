@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from wbgs_jax._util.cli import parse_positions, run_command, say
+from wbgs_jax._util.cli import parse_number, parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import check_writable
@@ -133,7 +133,7 @@ def plane_of(command: Command, dataset: Any) -> Any:
     low, high = DatasetScene(dataset).box[:, :2]
     if command.area:
         try:
-            corners = np.array([[float(part) for part in corner.split(",")] for corner in command.area.split(":")])
+            corners = np.array([[parse_number(part) for part in corner.split(",")] for corner in command.area.split(":")])
         except ValueError:
             corners = np.zeros(0)
         if corners.shape != (2, 2) or not np.isfinite(corners).all() or not (corners[0] < corners[1]).all():

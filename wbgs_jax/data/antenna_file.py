@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Inexact
 
+from wbgs_jax._util.cli import parse_number
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_arrays, read_csv, read_text
 from wbgs_jax.radio.antenna import Antenna, tabulated, zenith_weights
@@ -61,7 +62,7 @@ def _read_csv(path: Path) -> Antenna:
     most_rows = 1_000_000  # largest number of directions: finer than half a degree
     for line, row in rows:
         try:
-            table.append([float(row[column]) for column in columns])
+            table.append([parse_number(row[column]) for column in columns])
         except ValueError:
             raise UserError(f"line {line} of {path} lacks a number; fill {', '.join(needed)}") from None
         if len(table) > most_rows:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from wbgs_jax._util.cli import parse_number
 from wbgs_jax._util.errors import UserError
 
 Tokens = tuple[str, ...]
@@ -133,7 +134,7 @@ def numbers(path: Path, header: list[str], rows: list[list[str]], columns: list[
     for i, row in enumerate(rows):
         for k, column in enumerate(where):
             try:
-                values[i, k] = float(row[column]) if row[column] else np.nan
+                values[i, k] = parse_number(row[column]) if row[column] else np.nan
             except ValueError:
                 hint = "leave cells empty where nothing was received"
                 raise UserError(f"{path}, row {i + 1}: {row[column]!r} is not a number; {hint}") from None

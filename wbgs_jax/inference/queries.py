@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from wbgs_jax._util.cli import parse_vector
+from wbgs_jax._util.cli import parse_number, parse_vector
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_csv
 
@@ -139,7 +139,7 @@ def parse_sweep(word: str) -> tuple[float, ...]:
     """Returns logarithmically spaced frequencies (GHz), including both ends, parsed from "LOWEST:HIGHEST:NUMBER"."""
     low, high, number = _three(word, "--sweep", "1:100:50")
     try:
-        ends = float(low), float(high)
+        ends = parse_number(low), parse_number(high)
     except ValueError:
         ends = np.nan, np.nan
     if not (0 < ends[0] < np.inf and 0 < ends[1] < np.inf):
@@ -178,7 +178,7 @@ def _read_columns(path: Path, columns: tuple[str, ...], name: str) -> Float[np.n
     places, found = [names.index(column) for column in columns], []
     for line, row in rows:
         try:
-            values = [float(row[place]) for place in places]
+            values = [parse_number(row[place]) for place in places]
         except ValueError:
             values = [np.nan]
         if not np.isfinite(values).all():
