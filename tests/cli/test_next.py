@@ -10,11 +10,12 @@ from wbgs_jax.commands.next import main
 
 def test_places_are_chosen_where_readings_lack(tmp_path, rng):
     data, out = folder(tmp_path, rng, n=25), tmp_path / "next.csv"
-    (tmp_path / "places.csv").write_text("x,y,z\n1,1,1.3\n7,1,1.3\n7.1,1,1.3\n500,1,1.3\n4,1.5,1.3\n")
+    (tmp_path / "places.csv").write_text("x,y,z\n1.0000123,1,1\n7.0000123,1,1\n7.1000123,1,1\n500,1,1\n4.0000123,1.5,1\n")
     done = call(main, "--data", data, "--candidates", tmp_path / "places.csv", "--count", 2, "--start", "0,0,1.3", "--out", out)
     assert done.code == 0, done.err
     table = np.genfromtxt(out, delimiter=",", names=True)
     assert len(table) == 2 and table["x"].max() < 10 and (table["expected_error"] > 0).all()
+    assert set(table["x"]) <= {1.0000123, 7.0000123, 7.1000123, 4.0000123}
     assert "1 of 5 candidates are left out" in done.err
     assert done.out.splitlines()[0].lstrip().startswith("1. (")
 

@@ -23,6 +23,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import check_writable, write_csv
 from wbgs_jax.commands.options import TrainedFieldOptions, check_suffixes, load_field, parse_frequencies
 from wbgs_jax.inference import queries as parsing
+from wbgs_jax.inference.results_file import EXACT
 
 
 @dataclass(frozen=True)
@@ -167,7 +168,7 @@ def choose(command: Command) -> None:
     say(f"r.m.s. error over {len(places)} candidates: {100 * fall:.0f} % lower after these {len(chosen)} measurements")
     say(f"(as expected now, with errors that are alike over {length:.2g} m)")
     if command.out:
-        rows = ([f"{value:g}" for value in (*chosen[one], error[found.numbers[one]])] for one in order)
+        rows = ([*(format(part, EXACT) for part in chosen[one]), f"{error[found.numbers[one]]:g}"] for one in order)
         write_csv(command.out, [["x", "y", "z", "expected_error"], *rows])
         say(f"places: {command.out}")
 

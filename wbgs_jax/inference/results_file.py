@@ -186,7 +186,8 @@ def _difference(before: Any, now: dict[str, Any]) -> str:
     return ", ".join(key for key in now if before.get(key) != json.loads(json.dumps(now[key])))
 
 
-DIGITS = ".7g"
+DIGITS, EXACT = ".7g", ".12g"
+"""Formats of results, which are in single precision, and of places and frequencies."""
 
 
 def write(path: Path, what: str, answers: Answers, queries: Queries, source: dict[str, Any]) -> None:
@@ -215,18 +216,20 @@ def query_rows(answers: Answers, queries: Queries) -> Iterator[list[Any]]:
     yield [*COLUMNS, *(name for name, _ in columns)]
     positions, frequencies = queries.flat()
     for i, (position, frequency) in enumerate(zip(positions, frequencies, strict=True)):
-        numbers = [*position, frequency / 1e9, *(values[i] for _, values in columns)]
-        yield [format(float(number), DIGITS) for number in numbers]
+        link, numbers = (*position, frequency / 1e9), (values[i] for _, values in columns)
+        yield [*(format(float(part), EXACT) for part in link), *(format(float(number), DIGITS) for number in numbers)]
 
 
 def table_rows(answers: Answers) -> Iterator[list[Any]]:
     """Yields a header, then the rows of a table; columns that hold several numbers per row are in archives only."""
     names = [name for name in answers.names() if next(answers.pieces(name)).ndim == 1]
+    digits = [EXACT if name in (*COLUMNS, "frequency_ghz") else DIGITS for name in names]
     yield names
     for number in range(len(answers)):
         with answers.opened(number) as block:
             for row in zip(*(block[name] for name in names), strict=True):
-                yield [format(value, DIGITS) if isinstance(value, np.floating) else value for value in row]
+                cells = zip(row, digits, strict=True)
+                yield [format(value, own) if isinstance(value, np.floating) else value for value, own in cells]
 
 
 def lines(what: str, answers: Answers, queries: Queries, source: dict[str, Any]) -> list[str]:
