@@ -100,6 +100,14 @@ def test_a_model_without_an_answer(tmp_path):
         (["--paths", "gone", "--ghz", "28", "--out", "a.npz"], ["cannot read gone"]),
         (["--paths", "gone", "--out", "a.npz"], ["cannot read gone"]),
         (["--paths", "gone", "--out", "a.ply"], ["does not end in .npz"]),
+        (["room.glb", "--ghz", "28", "--out", "a.npz"], ["--ghz has no effect on a model; it belongs to --run or paths of"]),
+        (
+            ["--paths", "gone", "--tx", "1,0,1", "--out", "a.npz"],
+            ["--tx has no effect on paths of Sionna RT or"],
+        ),
+        (["--paths", ".", "--port", "1", "--out", "a.npz"], ["--port has no effect on paths of DeepMIMO; it belongs to paths"]),
+        (["--run", "RUN", "--tx=1,0,1", "--ghz=28", "--swap", "--out", "a.npz"], ["--swap has no effect on --run"]),
+        (["--run", "RUN", "--tx=1,0,1", "--ghz=28", "--scale=1", "--out", "a.npz"], ["--scale has no effect on --run"]),
         (["--paths", "gone", "--ghz", "28", "--out", "/dev/null/a.npz"], ["cannot write /dev/null/a.npz"]),
     ],
 )

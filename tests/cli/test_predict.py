@@ -271,10 +271,10 @@ def test_a_line_a_sweep_and_a_grid(hearing, tmp_path):
 
 def test_a_file_of_queries(hearing, tmp_path):
     queries, out, picture = tmp_path / "q.csv", tmp_path / "a.csv", tmp_path / "a.png"
-    queries.write_text("x,y,z,ghz\n1,0,1,5\n-1,0,1,2\n0,0,1,5\n")
+    queries.write_text("x,y,z,ghz\n1,0,1,5\n-1,0,1,2\n0,0,1234.56789012,2.4123456789\n")
     files = ["--out", out, "--picture", picture]
     assert predict(*hearing, "--queries", queries, "--what", "power", *files).code == 0
-    assert out.read_text().splitlines()[1:] == ["1,0,1,5,-54", "-1,0,1,2,-59", "0,0,1,5,-55"]
+    assert out.read_text().splitlines()[1:] == ["1,0,1,5,-54", "-1,0,1,2,-59", "0,0,1234.56789012,2.4123456789,-57.58765"]
     result = predict(*hearing, "--queries", queries, "--out", tmp_path / "a.npz")
     assert result.code == 0 and "(3 queries)" in result.err
     with np.load(tmp_path / "a.npz") as answer:
@@ -284,13 +284,14 @@ def test_a_file_of_queries(hearing, tmp_path):
 @pytest.mark.heavy
 def test_paths_of_a_file_of_queries(coherent, tmp_path):
     queries, out = tmp_path / "q.csv", tmp_path / "a.csv"
-    queries.write_text("x,y,z,ghz\n1,0.5,1.5,28\n1,0.5,1.5,2.4\n-1,1,1.2,28\n")
+    queries.write_text("x,y,z,ghz\n1.23456789,0.5,1.5,28\n1,0.5,1.5,2.412345678\n-1,1,1.2,28\n")
     result = predict("--run", coherent, "--queries", queries, "--what", "paths", "--out", out)
     assert result.code == 0, result.err
     rows = [row.split(",") for row in out.read_text().splitlines()[1:]]
     numbers = [int(row[0]) for row in rows]
     assert numbers == sorted(numbers) and {*numbers} == {0, 1, 2}
-    assert {(int(row[0]), float(row[4])) for row in rows} == {(0, 28.0), (1, 2.4), (2, 28.0)}
+    assert {(int(row[0]), float(row[4])) for row in rows} == {(0, 28.0), (1, 2.412345678), (2, 28.0)}
+    assert rows[0][1:4] == ["1.23456789", "0.5", "1.5"]
 
 
 def test_what_was_interrupted_goes_on(hearing, tmp_path, monkeypatch):
@@ -415,6 +416,13 @@ def test_the_whole_channel(coherent, tmp_path):
         (["--what", "mimo", "--tx-array", "4"], ["--tx-array 4 is not an array"]),
         (["--what", "mimo", "--tx-array", "0x3"], ["--tx-array 0x3"]),
         (["--what", "paths", "--tx-velocity", "1,2"], ["--tx-velocity 1,2 is not a velocity"]),
+        (["--tx-array", "2x2"], ["--tx-array has no effect on --what spectra; it belongs to mimo"]),
+        (
+            ["--what", "paths", "--band-mhz", "20"],
+            ["--band-mhz has no effect on --what paths; it belongs to freq"],
+        ),
+        (["--what", "mimo", "--points", "8"], ["--points has no effect on --what mimo"]),
+        (["--what", "mimo", "--rx-velocity", "1,0,0"], ["--rx-velocity has no effect on --what mimo; it belongs to paths"]),
         (["--what", "frequency-response", "--points", "1"], ["is not a band"]),
         (["--what", "frequency-response", "--band-mhz", "-5"], ["is not a band"]),
         (["--what", "frequency-response", "--band-mhz", "100000"], ["reaches -22 GHz"]),

@@ -33,8 +33,8 @@ MAINS = {
 SEEDS = {
     "train": "--scene box.npz --out made/run --field nerf2 --preset smoke --seed 3 --train-ghz 1 10 --optim.steps 200",
     "eval": "--run box --data box.npz --part test --json --no-pictures --results made/results",
-    "predict": "--run box --tx 1,0,1 -1,0.5,1 --ghz 10 28 --what power --out made/x.csv",
-    "predict lines": "--run box --line 0,0,1:1,1,1:4 --sweep 1:60:3 --rx 0.5,0,1 --out made/x.npz --tx-velocity 1,0,0",
+    "predict": "--run box --tx 1,0,1 -1,0.5,1 --ghz 10 28 --what paths --tx-velocity 1,0,0 --out made/x.csv",
+    "predict lines": "--run box --line 0,0,1:1,1,1:4 --sweep 1:60:3 --rx 0.5,0,1 --out made/x.npz",
     "predict grids": "--run box --grid 0,0,1:1,1,2:2x2x1 --ghz 28 --what frequency-response --points 8 --out made/x.npz",
     "predict queries": "--run box --queries queries.csv --out made/x.npz --resume --tx-array 2x2 --what mimo",
     "map": "--run box --ghz 10 28 --what power --height 1.2 --step 0.5 --area -1,-1:1,1 --out made/map.npz",

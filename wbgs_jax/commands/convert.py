@@ -30,6 +30,17 @@ from wbgs_jax.inference.queries import parse_array, parse_grid
 
 # Modules that load JAX are imported where they are used, as in predict.py.
 
+RUN, MODEL, SIONNA, DEEPMIMO = "--run", "a model", "paths of Sionna RT", "paths of DeepMIMO"
+KINDS = {
+    **dict.fromkeys(("materials", "up", "scale"), (MODEL,)),
+    **dict.fromkeys(("tx", "grid", "rx"), (RUN,)),
+    "ghz": (RUN, SIONNA, DEEPMIMO),
+    **dict.fromkeys(("array", "mesh", "swap"), (SIONNA, DEEPMIMO)),
+    **dict.fromkeys(("port", "tx_antenna"), (SIONNA,)),
+    **dict.fromkeys(("tx_set", "tx_index", "rx_set"), (DEEPMIMO,)),
+}
+"""Inputs that options belong to."""
+
 
 @dataclass(frozen=True)
 class Command:
@@ -75,6 +86,14 @@ class Command:
     """... and of the set of users."""
 
 
+def check_options(command: Command, *kinds: str) -> None:
+    """Raises a `UserError` for an option that belongs to other inputs than (one of) these."""
+    for name, own in KINDS.items():
+        if getattr(command, name) != getattr(Command, name) and not set(own) & set(kinds):
+            option, given = f"--{name.replace('_', '-')}", " or ".join(kinds)
+            raise UserError(f"{option} has no effect on {given}; it belongs to {' or '.join(own)}")
+
+
 def check(command: Command) -> None:
     """Raises a `UserError` for an invalid command line."""
     if [command.run, command.paths, command.model].count(None) != 2:
@@ -82,6 +101,7 @@ def check(command: Command) -> None:
             "give one of --run RUN, to convert a trained field, --paths FILE, to create a scene file from paths, or a model "
             "such as room.glb, to create a room file"
         )
+    check_options(command, *((RUN,) if command.run else (MODEL,) if command.model else (SIONNA, DEEPMIMO)))
     if command.run is None and command.out.suffix != ".npz":
         raise UserError(f"--out {command.out} does not end in .npz, as scene files and room files must")
     if command.run is None:
@@ -161,9 +181,11 @@ def take_in(command: Command) -> str:
         raise UserError(
             f"{command.paths} is of an unknown kind; give an .npz file with Sionna's arrays, or a DeepMIMO scenario"
         )
+    of_deepmimo = is_deepmimo(command.paths)
+    check_options(command, DEEPMIMO if of_deepmimo else SIONNA)
     room = None if command.mesh is None else open_room(command.mesh)
     shape, name = parse_array(command.array, "--array") if command.array else None, command.out.stem
-    if is_deepmimo(command.paths):
+    if of_deepmimo:
         paths = load_deepmimo(command.paths, hertz, command.tx_set, command.tx_index, command.rx_set)
         check_paths(paths, str(command.paths))
         paths = paths if command.swap else paths.reversed()

@@ -51,6 +51,14 @@ if TYPE_CHECKING:
 else:
     What = Literal[names_for("predict")]
 
+BELONG = {
+    "tx_velocity": "paths",
+    "rx_velocity": "paths",
+    "band_mhz": "frequency-response",
+    "points": "frequency-response",
+    "tx_array": "mimo",
+}
+"""Options that affect a single quantity."""
 BLOCK = 256
 """Number of queries predicted and stored at a time."""
 
@@ -115,6 +123,9 @@ def check(command: Command) -> None:
     for several in (places, bands):
         if len(several) > 1:
             raise UserError(f"--{several[0]} and --{several[1]} exclude each other; give one of them")
+    for name, what in BELONG.items():
+        if command.what != what and getattr(command, name) != getattr(Command, name):
+            raise UserError(f"--{name.replace('_', '-')} has no effect on --what {command.what}; it belongs to {what}")
     for name, word in _velocities(command).items():
         parse_vector(word, f"--{name}-velocity")
     parsing.parse_array(command.tx_array)
