@@ -38,6 +38,16 @@ def test_a_point_names_the_body_of_the_mesh_that_is_nearest():
 
 
 @pytest.mark.heavy
+def test_the_speed_is_the_way_over_the_duration(tmp_path):
+    """Few instants, the last of which is one step before the end."""
+    options = ("--example", "--tx", "1,0.5,1.5", "3,0.5,1.5", "--ghz", 1, "--seconds", 2, "--rate", 20)
+    done = call(main, *options, "--out", tmp_path / "way.npz")
+    assert done.code == 0, done.err
+    with np.load(tmp_path / "way.npz") as found:
+        np.testing.assert_allclose(np.diff(found["tx_position"][:, 0]), 1.0 * np.diff(found["time_s"]), rtol=1e-9)
+
+
+@pytest.mark.heavy
 def test_a_person_who_crosses_the_line_of_sight_blocks_it(tmp_path):
     """The power falls while the person stands between transmitter and receiver, and is as before on either side."""
     receiver = np.asarray(load_trained().dataset().receiver().position)

@@ -142,7 +142,7 @@ def simulate(command: Command) -> None:
     frequency_hz = float(parse_frequencies((command.ghz,))[0])
     seconds = times_of(command, frequency_hz)
     rate_hz = 1 / (seconds[1] - seconds[0])
-    share = np.linspace(0, 1, len(seconds))
+    share = seconds / command.seconds
     loaded = load_field(command.folder, command.rx, frequency_hz)
     field, params, motion = motion_of(command, *loaded.trained.field.receiver_independent(loaded.trained.params), share)
     tx = position_along(parse_positions(command.tx), share)
