@@ -14,6 +14,14 @@ def test_beams_are_ranked_as_a_search_through_all_of_them_ranks_them(rng):
         assert ranked.tolist() == sorted(range(64), key=lambda beam: -heard[beam])[:5]
 
 
+def test_spectra_and_counts_are_checked(rng):
+    assert rank_beams(np.zeros((0, 90, 360)), 4).shape == (0, 4)
+    assert rank_beams(rng.random((2, 90, 360)), 64).shape == (2, 64)
+    for shape, count, words in (((90, 360), 3, "shape"), ((2, 360, 90), 3, "shape"), ((2, 90, 360), 65, "1 to 64 beams")):
+        with pytest.raises(ValueError, match=words):
+            rank_beams(np.zeros(shape), count)
+
+
 def test_a_beam_points_where_its_pixel_is(rng):
     row, column = divmod(int(codebook()[beam := int(rng.integers(64))]), 360)
     np.testing.assert_array_equal(beam_directions()[beam], pas_directions()[row, column])

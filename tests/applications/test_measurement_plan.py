@@ -61,6 +61,13 @@ def test_impossible_choices_are_refused(places, count, length):
         choose_next_places(*places, length, count)
 
 
+@pytest.mark.parametrize("wrong", [np.nan, -0.1, np.inf])
+def test_errors_that_cannot_be_expected_are_refused(places, wrong):
+    candidates, error, measured = places
+    with pytest.raises(ValueError, match="expected_error is negative or not finite"):
+        choose_next_places(candidates, np.concatenate([error[:-1], [wrong]]), measured, 1.5, 3)
+
+
 def test_a_walk_visits_every_place_once_and_is_short():
     places = np.random.default_rng(1).uniform(0, 1, (12, 3))
     order = walking_order(places, np.zeros(3))
@@ -71,3 +78,4 @@ def test_a_walk_visits_every_place_once_and_is_short():
     assert length < min(others)
     line = np.array([[3.0, 0, 0], [1, 0, 0], [2, 0, 0], [0.5, 0, 0]])
     assert walking_order(line, np.zeros(3)).tolist() == [3, 1, 2, 0]
+    assert walking_order(line.tolist(), [6, 0, 0]).tolist() == [0, 2, 1, 3]

@@ -43,6 +43,15 @@ def test_elements_look_where_the_angles_say_and_stay_level(rng):
         assert abs(float(turn[2, 1])) < 1e-6
 
 
+def test_orientations_of_many_and_of_lists_are_those_of_each(rng):
+    for shape in ((2, 2), (3, 4, 2)):
+        angles = rng.uniform(-1.5, 1.5, shape)
+        each = [boresight_quaternion(one) for one in angles.reshape(-1, 2)]
+        np.testing.assert_allclose(boresight_quaternion(angles.tolist()).reshape(-1, 4), each, atol=1e-6)
+    with pytest.raises(ValueError, match="azimuth and elevation"):
+        boresight_quaternion([0.1, 0.2, 0.3])
+
+
 @pytest.mark.heavy
 def test_one_wave_is_heard_best_by_elements_that_look_at_it(rng):
     for angles in rng.uniform([-3, -0.9], [3, 0.9], (3, 2)):

@@ -34,18 +34,24 @@ HIGHEST = 1.55
 """Largest elevation, radians."""
 
 
-def boresight_quaternion(angles: Float[Array, "2"]) -> Float[Array, "4"]:
+def boresight_quaternion(angles: Any) -> Float[Array, "*b 4"]:
     """Returns the quaternion (wxyz) of a receiver whose +x, the boresight of directive elements, has this azimuth and elevation
     (radians, world frame) and whose y axis stays horizontal.
 
     Args:
-        angles: azimuth and elevation, radians.
+        angles: (*b, 2), azimuth and elevation, radians.
 
     Returns:
-        Unit quaternion (4,), for `make_receiver(orientation=...)`.
+        Unit quaternions (*b, 4), for `make_receiver(orientation=...)`.
+
+    Raises:
+        ValueError: the last axis is not azimuth and elevation.
     """
-    (ca, ce), (sa, se) = jnp.cos(angles / 2), jnp.sin(angles / 2)
-    return jnp.stack([ca * ce, sa * se, -ca * se, sa * ce])
+    half = jnp.asarray(angles) / 2
+    if half.shape[-1:] != (2,):
+        raise ValueError(f"angles have shape {half.shape}; pass (..., 2), azimuth and elevation in radians")
+    (ca, ce), (sa, se) = (jnp.moveaxis(part, -1, 0) for part in (jnp.cos(half), jnp.sin(half)))
+    return jnp.stack([ca * ce, sa * se, -ca * se, sa * ce], -1)
 
 
 def predict_isotropic_paths(field: Field, params: Params, receiver: Any, transmitters: Any, frequency_hz: float) -> Paths:

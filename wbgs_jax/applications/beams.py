@@ -29,18 +29,26 @@ class BeamScores(NamedTuple):
     """... and by the best of the first three."""
 
 
-def rank_beams(spectra: Float[AnyArray, "n 90 360"], count: int = 3) -> Int[np.ndarray, "n count"]:
+def rank_beams(spectra: Any, count: int = 3) -> Int[np.ndarray, "n count"]:
     """Returns the strongest beams of the codebook (0 to 63: four rings from the zenith down, sixteen azimuths from -180 degrees
     on) in every spectrum, the best one first.
 
     Args:
-        spectra: measured or predicted.
-        count: beams per spectrum.
+        spectra: (n, 90, 360), measured or predicted.
+        count: beams per spectrum, 1 to 64.
 
     Returns:
         Indices of beams (n, count).
+
+    Raises:
+        ValueError: the spectra are not (n, 90, 360), or the count is not within the codebook.
     """
-    received = np.asarray(spectra).reshape(len(spectra), -1)[:, codebook()]
+    values, beams = np.asarray(spectra), codebook()
+    if values.ndim != 3 or values.shape[1:] != (90, 360):
+        raise ValueError(f"spectra have shape {values.shape}; pass (n, 90, 360)")
+    if not 1 <= count <= len(beams):
+        raise ValueError(f"count is {count}; give 1 to {len(beams)} beams")
+    received = values.reshape(-1, 90 * 360)[:, beams]
     return np.argsort(-received, axis=1, kind="stable")[:, :count]
 
 
@@ -56,7 +64,7 @@ def choose_beams(predict: Predictor, tx_positions: Any, frequencies_hz: Any, cou
         predict: predicts a field's spectra, from `make_predictor`.
         tx_positions: (n, 3), world frame, metres.
         frequencies_hz: (n,) or one, hertz.
-        count: beams per transmitter.
+        count: beams per transmitter, 1 to 64.
 
     Returns:
         Indices of beams (n, count), as in `rank_beams`.

@@ -8,7 +8,7 @@ far as possible from all others. Choosing what reduces the mean variance most (A
 measured sets.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -53,12 +53,14 @@ def choose_next_places(
         The places, and the expected error after each.
 
     Raises:
-        ValueError: the count exceeds the number of candidates, or the length is not positive.
+        ValueError: the count exceeds the number of candidates, the length is not positive, or an error is negative or NaN.
     """
     if not 0 < count <= len(candidates):
         raise ValueError(f"count is {count}; there are {len(candidates)} candidates")
     if not length > 0:
         raise ValueError(f"length is {length}; it must be positive")
+    if not (np.isfinite(expected_error) & (np.asarray(expected_error) >= 0)).all():
+        raise ValueError("expected_error is negative or not finite; leave out the candidates without one")
     covariance = _given(candidates, expected_error, measured, length)
     nugget = NUGGET * np.square(expected_error) + np.finfo(float).tiny
     chosen, error = np.zeros(count, int), np.zeros(count + 1)
@@ -74,20 +76,20 @@ def choose_next_places(
     return NextPlaces(chosen, error)
 
 
-def walking_order(places: Float[np.ndarray, "n 3"], start: Float[np.ndarray, "3"] | None = None) -> Int[np.ndarray, " n"]:
+def walking_order(places: Any, start: Any = None) -> Int[np.ndarray, " n"]:
     """Returns a short walk through all places: the nearest one next, then parts reversed as long as that shortens the walk
     (2-opt; Croes 1958).
 
     Args:
-        places: metres.
-        start: where the walk begins, metres; by default at the first place.
+        places: (n, 3), metres.
+        start: (3,), where the walk begins, metres; by default at the first place.
 
     Returns:
         Indices of the places, in order.
     """
     if not len(places):
         return np.zeros(0, int)
-    points = places if start is None else np.concatenate([start[None], places])
+    points = np.asarray(places, float) if start is None else np.concatenate([np.asarray(start, float)[None], places])
     distance = cdist(points, points)
     order, left = [0], set(range(1, len(points)))
     while left:
