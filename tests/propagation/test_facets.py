@@ -145,6 +145,17 @@ def test_walls_apart_and_bodies_at_a_wall_stay_what_they_are():
     assert edges_of_facets(facets).length.size == 12
 
 
+def test_a_wall_that_is_divided_where_another_meets_it_has_no_edge():
+    """A T of three sheets: two of them alone would be a wedge with three quarters of a turn in front of it, but the third
+    closes it."""
+    left, right = (rectangle((x, 0, 0), (0, 0, 3), (4, 0, 0)) for x in (-4, 0))
+    inner = rectangle((0, -3, 0), (0, 3, 0), (0, 0, 3))
+    assert segments(edges_of(left, inner, material=[0, 0])) == [[(0, 0, 0), (0, 0, 3)]]
+    assert edges_of(left, right, inner, material=[0, 0, 0]).length.size == 0
+    solids = [box((0, 0, 0), (1, 1, 1)), box((1, 0, 0), (3, 1, 1)), box((0, 0, 4), (9, 9, 9))]
+    assert edges_of(*solids, material=[0, 0, 0]).length.size == 36  # solids that touch keep theirs
+
+
 def test_one_object_of_two_materials_is_two_bodies():
     mesh = mesh_of(box((0, 0, 0), (1, 1, 1)))
     top = (np.asarray(mesh.vertices)[np.asarray(mesh.faces)][..., 2] == 1).all(-1)

@@ -19,7 +19,10 @@ from jaxtyping import Bool, Float, Int, Shaped
 from scipy.spatial import cKDTree
 
 from wbgs_jax._util.pytree import AnyArray, pytree
-from wbgs_jax.mesh.facets import CORNERS, WELD, Facets, half_planes_of
+from wbgs_jax.mesh.facets import CORNERS, FLAT, WELD, Facets, half_planes_of, of_solids
+
+SHARPEST = 0.05
+"""Radians: edges with a smaller angle between the normals of their faces are part of a smooth surface."""
 
 
 @pytree
@@ -112,8 +115,7 @@ def _wedge(
     j, c, d = second
     turn = np.arccos(np.clip(normal[i] @ normal[j], -1, 1))
     outward = (centre[j] - centre[i]) @ normal[i] < 0 and (centre[i] - centre[j]) @ normal[j] < 0
-    sharpest = 0.05  # radians: edges with a smaller angle between their normals are part of a smooth surface
-    if turn <= sharpest or not outward:
+    if turn <= SHARPEST or not outward:
         return []
     length = np.linalg.norm(b - a)
     along = (b - a) / length
@@ -127,14 +129,15 @@ def _wedge(
 
 
 def _covered(edges: Edges, facets: Facets) -> Bool[np.ndarray, " e"]:
-    """Returns whether another surface closes the gap in front of an edge: joints between bodies do not diffract."""
+    """Returns whether another surface closes the gap in front of an edge, or that an edge of sheets is the end of a third one
+    between its two faces: neither joints between bodies nor junctions of walls diffract."""
     out = edges.normal_0 + edges.normal_n
     out = out / np.maximum(
         np.linalg.norm(out, axis=-1, keepdims=True), WELD
     )  # the outward direction between the two faces of a sheet is zero
     middle = edges.start + edges.direction * edges.length[:, None] / 2
     corners, half_planes = np.asarray(facets.corners), half_planes_of(facets)
-    centre, covered = corners.mean(1), np.zeros(len(middle), bool)
+    centre, covered, sheet = corners.mean(1), np.zeros(len(middle), bool), ~of_solids(facets)[edges.facet]
     gap = 0.006  # metres: surfaces nearer than this are joined
     radius = np.linalg.norm(corners - centre[:, None], axis=-1).max(1) + 2 * gap
     tree = cKDTree(middle)
@@ -146,10 +149,18 @@ def _covered(edges: Edges, facets: Facets) -> Bool[np.ndarray, " e"]:
         normal, point, way = np.asarray(facets.normal)[facet], middle[edge], out[edge]
         height, along = np.sum(normal * point, -1) - np.asarray(facets.offset)[facet], np.sum(normal * way, -1)
         distance = -height / np.where(along == 0, 1, along)
-        ahead = np.flatnonzero((along != 0) & (distance > WELD) & (distance < gap))
-        facet, edge, there = facet[ahead], edge[ahead], (point + distance[:, None] * way)[ahead]
-        inside = (np.sum(half_planes.inward[facet] * there[:, None], -1) >= half_planes.offset[facet]).all(-1)
-        covered[edge[inside]] = True
+        closes = [((along != 0) & (distance > WELD) & (distance < gap), point + distance[:, None] * way)]
+        # A facet that contains the edge lies on one side of it, or on both.
+        contains = sheet[edge] & (np.abs(height) < 10 * WELD) & (np.abs(np.sum(normal * edges.direction[edge], -1)) < FLAT)
+        tangent = np.cross(normal, edges.direction[edge])
+        for beside in (tangent, -tangent):
+            out_of_0, out_of_n = (np.sum(beside * face[edge], -1) for face in (edges.normal_0, edges.normal_n))
+            closes.append((contains & (np.maximum(out_of_0, out_of_n) > SHARPEST), point + gap * beside))
+        for may, there in closes:
+            which = np.flatnonzero(may)
+            of, there = facet[which], there[which, None]
+            inside = (np.sum(half_planes.inward[of] * there, -1) >= half_planes.offset[of]).all(-1)
+            covered[edge[which[inside]]] = True
     return covered
 
 

@@ -141,6 +141,24 @@ def areas(facets: Facets) -> Float[np.ndarray, " f"]:
     return _polygon_normals(np.asarray(facets.corners))[1]
 
 
+def of_solids(facets: Facets) -> Bool[np.ndarray, " f"]:
+    """Returns which facets belong to closed bodies, whose normals point outwards; all others are sheets. A closed body as large
+    as the scene is the room itself, hence made of sheets."""
+    corners, area, closed = np.asarray(facets.corners), areas(facets), np.zeros(len(facets.offset), bool)
+    room_share = 0.9  # minimum size of the room's own mesh relative to the scene's length, width and height
+    room = room_share * np.ptp(corners, axis=(0, 1))
+    gap = 0.01  # maximum share of the surface that a closed body may lack
+    for group in (np.asarray(facets.mover), np.asarray(facets.body)):
+        flux, low, high = np.zeros((3, group.max(initial=-1) + 1, 3))
+        low[:], high[:] = np.inf, -np.inf
+        np.add.at(flux, group, np.asarray(facets.normal) * area[:, None])
+        np.minimum.at(low, group, corners.min(1))
+        np.maximum.at(high, group, corners.max(1))
+        whole = np.linalg.norm(flux, axis=-1) < gap * np.bincount(group, area, len(flux))
+        closed |= (whole & ~(high - low > room).all(-1))[group]
+    return closed
+
+
 def _weld(vertices: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, " v"]]:
     """Returns the corners without duplicates, and the new index of every vertex."""
     different, which = np.unique(vertices, axis=0, return_inverse=True)  # first, as there may be many pairs of equal ones
