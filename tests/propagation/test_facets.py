@@ -11,7 +11,7 @@ import trimesh
 from builders.rooms import box, edges_of, facets_of, mesh_of, rectangle, room
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.mesh.edges import edges_of_facets
+from wbgs_jax.mesh.edges import about_edges, edges_of_facets
 from wbgs_jax.mesh.facets import areas, facets_from_mesh, half_planes_of
 
 
@@ -75,9 +75,9 @@ def test_triangles_and_slopes_stay_what_they_are():
 
 def test_sheets_and_inner_corners_have_no_edges():
     assert edges_of(*room()).length.size == 0
-    inside_out = box((0, 0, 0), (1, 1, 1))
+    inside_out = box((1, 1, 1), (2, 2, 2))
     inside_out.invert()
-    assert edges_of(inside_out).length.size == 0
+    assert edges_of(*room(), inside_out).length.size == 0
 
 
 @pytest.mark.parametrize("material", [None, [0, 0]])
@@ -154,6 +154,32 @@ def test_a_wall_that_is_divided_where_another_meets_it_has_no_edge():
     assert edges_of(left, right, inner, material=[0, 0, 0]).length.size == 0
     solids = [box((0, 0, 0), (1, 1, 1)), box((1, 0, 0), (3, 1, 1)), box((0, 0, 4), (9, 9, 9))]
     assert edges_of(*solids, material=[0, 0, 0]).length.size == 36  # solids that touch keep theirs
+
+
+CORNERS_OF_L = np.array([(0, 0), (8, 0), (8, 3), (4, 3), (4, 6), (0, 6)], float)
+"""Corners (x, y) of a room; the fourth is reentrant."""
+
+
+@pytest.mark.parametrize("facing", ["in", "out", "either"])
+@pytest.mark.parametrize("shell", [True, False])
+def test_the_reentrant_corner_of_a_room_diffracts_whichever_way_its_walls_face(shell, facing):
+    """It is the only edge with an outer angle on the side of the room. All others have theirs outside."""
+    ends = np.column_stack([CORNERS_OF_L, np.zeros(6)]), np.column_stack([np.roll(CORNERS_OF_L, -1, 0), np.zeros(6)])
+    parts = [rectangle(a, b - a, (0, 0, 3)) for a, b in zip(*ends, strict=True)]
+    for level in (0, 3) if shell else ():
+        for low, high in (((0, 0), (4, 3)), ((4, 0), (8, 3)), ((0, 3), (4, 6))):
+            parts.append(rectangle((*low, level), (high[0] - low[0], 0, 0), (0, high[1] - low[1], 0)))
+            if level == 0:
+                parts[-1].invert()
+    for number, part in enumerate(parts):
+        if facing == "in" or (facing == "either" and number % 2):
+            part.invert()
+    edges = edges_of(*parts, material=[0] * len(parts))
+    assert edges.length.sum() == pytest.approx(74 if shell else 18)
+    inside = np.array([(1.0, 1.0, 1.0), (7.0, 2.0, 1.4), (2.0, 5.5, 2.0)])
+    _, distance = about_edges(inside.T[:, :, None], edges)
+    within = np.isfinite(distance).all(0)
+    assert segments(jax.tree.map(lambda leaf: leaf[within], edges)) == [[(4, 3, 0), (4, 3, 3)]]
 
 
 def test_one_object_of_two_materials_is_two_bodies():

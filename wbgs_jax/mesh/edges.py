@@ -1,6 +1,7 @@
 """Diffracting edges: where two facets of one body meet at an outer angle (host).
 
-Free edges of single sheets are not wedges and are omitted, as are inner corners.
+Free edges of single sheets are not wedges and are omitted, as are inner corners of solids. Where two sheets meet, they diffract
+the waves on that side on which the angle is an outer one: a room's own corners for waves outside, its reentrant ones within.
 
 Edges, reflection sequences and pairs can be padded to sizes that rarely change: displaced surfaces have slightly different
 numbers of them, and every new number would trigger a compilation. Padding never makes a path: padded edges have zero length,
@@ -36,9 +37,9 @@ class Edges:
     length: Float[AnyArray, " e"]
     """Metres."""
     normal_0: Float[AnyArray, "e 3"]
-    """Outward normal of the 0-face."""
+    """Normal of the 0-face that points out of the wedge: of a solid the outward one."""
     normal_n: Float[AnyArray, "e 3"]
-    """Outward normal of the n-face."""
+    """The same of the n-face."""
     facet: Int[AnyArray, " e"]
     """Index of the 0-face; both faces belong to one body and hence have one material."""
 
@@ -71,12 +72,11 @@ class _Side(NamedTuple):
 
 def edges_of_facets(facets: Facets) -> Edges:
     """Returns the edges (float64 and int32 NumPy arrays) that two facets of one body share, wholly or in part."""
-    normal, body, centre = np.asarray(facets.normal), np.asarray(facets.body), np.asarray(facets.corners).mean(1)
-    found = []
+    body, solid, found = np.asarray(facets.body), of_solids(facets), []
     for on_line in _sides_by_line(facets):
         for first, second in combinations(on_line, 2):
             if body[first.facet] == body[second.facet]:
-                found += _wedge(first, second, normal, centre)
+                found += _wedge(first, second, facets, bool(solid[first.facet] and solid[second.facet]))
     columns: Any = list(zip(*found, strict=True)) or [[]] * 6
     shapes = ((-1, 3), (-1, 3), (-1,), (-1, 3), (-1, 3), (-1,))
     arrays: Any = [np.array(column, np.float64).reshape(shape) for column, shape in zip(columns, shapes, strict=True)]
@@ -106,16 +106,20 @@ def _line(point: Float[np.ndarray, "3"], along: Float[np.ndarray, "3"]) -> tuple
     return tuple(int(i) for i in np.round(np.concatenate([along, foot]) * 1e3 + odd))
 
 
-def _wedge(
-    first: _Side, second: _Side, normal: Float[np.ndarray, "f 3"], centre: Float[np.ndarray, "f 3"]
-) -> list[tuple[Any, ...]]:
-    """Returns the edge (its fields) where two sides on one line overlap; none if they do not, or if the angle is an inner
-    one."""
+def _wedge(first: _Side, second: _Side, facets: Facets, solid: bool) -> list[tuple[Any, ...]]:
+    """Returns the edge (its fields) where two sides on one line overlap; none if they do not, or if the angle of a solid is an
+    inner one. Two sheets have an outer angle on one side, whichever way they face."""
     i, a, b = first
     j, c, d = second
-    turn = np.arccos(np.clip(normal[i] @ normal[j], -1, 1))
-    outward = (centre[j] - centre[i]) @ normal[i] < 0 and (centre[i] - centre[j]) @ normal[j] < 0
-    if turn <= SHARPEST or not outward:
+    normal_0, normal_n = np.asarray(facets.normal)[[i, j]]
+    centre_0, centre_n = np.asarray(facets.corners)[[i, j]].mean(1)
+    height_0, height_n = (centre_n - centre_0) @ normal_0, (centre_0 - centre_n) @ normal_n
+    if solid:
+        bends = max(height_0, height_n) < 0 and np.arccos(np.clip(normal_0 @ normal_n, -1, 1)) > SHARPEST
+    else:
+        bends = np.linalg.norm(np.cross(normal_0, normal_n)) > np.sin(SHARPEST)
+        normal_0, normal_n = -np.sign(height_0) * normal_0, -np.sign(height_n) * normal_n
+    if not bends:
         return []
     length = np.linalg.norm(b - a)
     along = (b - a) / length
@@ -123,9 +127,9 @@ def _wedge(
     low, high = max(low, 0.0), min(high, float(length))
     if high - low <= 10 * WELD:
         return []
-    sign = 1 if np.cross(normal[i], along) @ (centre[i] - a) > 0 else -1
+    sign = 1 if np.cross(normal_0, along) @ (centre_0 - a) > 0 else -1
     start = a + along * (low if sign > 0 else high)
-    return [(start, sign * along, high - low, normal[i], normal[j], i)]
+    return [(start, sign * along, high - low, normal_0, normal_n, i)]
 
 
 def _covered(edges: Edges, facets: Facets) -> Bool[np.ndarray, " e"]:
