@@ -234,6 +234,19 @@ def test_careless_exports_are_mended(wrong, said, rng):
     np.testing.assert_array_equal(*(np.unique(p + 0.0, axis=0) for p in planes))
 
 
+@pytest.mark.parametrize("other_way", [False, True])
+def test_a_triangle_that_is_there_twice_counts_once(other_way):
+    """Of a box and of a wall, whichever way the second one faces."""
+    parts = [box((0, 0, 0), (1, 2, 3)), rectangle((5, 0, 0), (0, 2, 0), (0, 0, 3))]
+    twice = []
+    for part in parts:
+        again = part.faces[:1, ::-1] if other_way else part.faces[:1]
+        twice.append(trimesh.Trimesh(part.vertices, np.concatenate([part.faces, again]), process=False))
+    with pytest.warns(UserWarning, match="triangles of other parts: 2"):
+        facets = facets_of(*twice)
+    assert areas(facets).sum() == pytest.approx(22 + 6) and len(facets.offset) == 7
+
+
 def test_bodies_of_one_part_that_touch_keep_both_faces():
     """Two blocks, one on the other: where they touch there are two slabs to pass."""
     lower, upper = box((0, 0, 0), (1, 1, 1)), box((0, 0, 1), (1, 1, 2))

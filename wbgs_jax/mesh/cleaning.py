@@ -1,4 +1,4 @@
-"""Repairs frequent errors of mesh exports: parts that contain every triangle twice, and inconsistent orientations.
+"""Repairs frequent errors of mesh exports: parts that contain triangles twice, and inconsistent orientations.
 
 A duplicated surface reflects twice and transmits through two slabs; triangles of opposite orientation form no diffracting edge.
 The helpers for sides and connected components are shared with other modules. Runs on the host.
@@ -54,20 +54,27 @@ def repaired(
 
 
 def _once(triangles: Int[np.ndarray, "t 3"], part: Int[np.ndarray, " t"]) -> Int[np.ndarray, " k"]:
-    """Returns the triangles without the duplicates in parts in which every triangle is repeated, in either orientation. If only
-    some are repeated, bodies of one part touch."""
+    """Returns the triangles without duplicates, in either orientation. Bodies of one part that touch share triangles that face
+    opposite ways and have no side with an odd number of triangles; unless all of their part are repeated, these stay."""
     corners = np.sort(triangles, 1)
     _, side = np.unique(names(part, corners[:, :2]), return_inverse=True)
     _, first, which, count = np.unique(
         side * (int(corners.max(initial=0)) + 1) + corners[:, 2], return_index=True, return_inverse=True, return_counts=True
     )
+    again = np.arange(len(triangles)) != first[which]
+    if not again.any():
+        return np.arange(len(triangles))
     single = np.zeros(part.max(initial=-1) + 1, bool)
     single[part[count[which] == 1]] = True
-    if single[part].all():
-        return np.arange(len(triangles))
-    doubled = len(np.unique(part[~single[part]]))
-    warnings.warn(f"duplicate triangles are ignored (parts of the mesh with every triangle twice: {doubled})", stacklevel=5)
-    return np.union1d(np.flatnonzero(single[part]), first)
+    _, edge, of_side = np.unique(names(np.repeat(part, 3), sides(triangles)), return_inverse=True, return_counts=True)
+    odd = (of_side % 2 == 1)[edge].reshape(-1, 3).any(1)
+    turn = np.prod(np.sign(triangles - np.roll(triangles, 1, 1)), 1)  # of an orientation; 0 for one with a corner twice
+    again &= ~single[part] | (turn != 0) & (odd | (turn == turn[first[which]]))
+    if again.any():
+        doubled, few = len(np.unique(part[~single[part]])), int(np.count_nonzero(again & single[part]))
+        counts = f"parts of the mesh with every triangle twice: {doubled}; triangles of other parts: {few}"
+        warnings.warn(f"duplicate triangles are ignored ({counts})", stacklevel=5)
+    return np.flatnonzero(~again)
 
 
 class _Neighbours(NamedTuple):
