@@ -247,6 +247,19 @@ def test_a_triangle_that_is_there_twice_counts_once(other_way):
     assert areas(facets).sum() == pytest.approx(22 + 6) and len(facets.offset) == 7
 
 
+@pytest.mark.parametrize("height", [0.0, 0.0005, 0.01])
+def test_a_carpet_on_the_floor_is_pointed_out(height):
+    """A cabinet on the floor and two boxes side by side are not."""
+    carpet = rectangle((1, 1, height), (2, 0, 0), (0, 1.5, 0))
+    solids = box((4, 1, 0), (4.5, 2, 2)), box((4.5, 1, 0), (5, 2, 2))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        facets_of(*room(), carpet, *solids)
+    messages = [str(one.message) for one in caught]
+    assert len(messages) == (height < 0.001)
+    assert all("pairs: 1, 3 square metres, the largest at 2, 1.75" in message for message in messages)
+
+
 def test_bodies_of_one_part_that_touch_keep_both_faces():
     """Two blocks, one on the other: where they touch there are two slabs to pass."""
     lower, upper = box((0, 0, 0), (1, 1, 1)), box((0, 0, 1), (1, 1, 2))

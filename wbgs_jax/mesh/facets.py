@@ -7,6 +7,7 @@ that meet, such as the walls of a room. Closed objects stay separate even where 
 """
 
 import dataclasses
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -90,7 +91,39 @@ def facets_from_mesh(mesh: Mesh) -> Facets:
     offset = np.sum(normals[order] * corners[order].mean(1), -1)
     _, rigid_body = np.unique(rigid_body[owner], return_inverse=True)
     numbers = (values.astype(np.int32) for values in (body[owner], material[owner], rigid_body.reshape(-1)))
-    return Facets(corners[order], normals[order], offset, *numbers)
+    facets = Facets(corners[order], normals[order], offset, *numbers)
+    _warn_of_coincident(facets)
+    return facets
+
+
+def _warn_of_coincident(facets: Facets) -> None:
+    """Warns of sheets that lie on each other, facets in descending order of their areas."""
+    most, apart, parallel = 20_000, 1e-3, 0.999  # sheets that are compared; metres between them; cosine between their normals
+    sheets = jax.tree.map(lambda leaf: leaf[~of_solids(facets)][:most], facets)
+    corners, half_planes = sheets.corners, half_planes_of(sheets)
+    centre, area, found = corners.mean(1), areas(sheets), []
+    radius, tree = np.linalg.norm(corners - centre[:, None], axis=-1).max(1, initial=0), cKDTree(centre)
+    at_once = 256  # sheets whose neighbourhood is searched together
+    for first in range(0, len(centre), at_once):
+        some = np.arange(first, min(first + at_once, len(centre)))
+        near = tree.query_ball_point(centre[some], radius[some], return_sorted=False)
+        large, small = np.repeat(some, [len(own) for own in near]), np.concatenate(near).astype(int)
+        cosine = np.sum(sheets.normal[large] * sheets.normal[small], -1)
+        apart_bodies = sheets.mover[large] != sheets.mover[small]  # blocks of one body that touch face opposite ways
+        along = (cosine > parallel) | (cosine < -parallel) & apart_bodies
+        height = np.abs(np.sum(sheets.normal[large] * centre[small], -1) - sheets.offset[large])
+        pairs = np.flatnonzero((small > large) & along & (height < apart))
+        large, small = large[pairs], small[pairs]
+        inside = np.sum(half_planes.inward[large] * centre[small, None], -1) >= half_planes.offset[large]
+        found.append(small[inside.all(-1)])
+    twice = np.concatenate([*found, np.zeros(0, int)])
+    if len(twice):
+        where = ", ".join(f"{value:.4g}" for value in centre[twice[0]])
+        warnings.warn(
+            f"open surfaces of the mesh lie on each other (pairs: {len(twice)}, {area[np.unique(twice)].sum():.3g} square "
+            f"metres, the largest at {where} m), and waves meet both; remove one of each pair",
+            stacklevel=4,
+        )
 
 
 def centres(facets: Facets, rigid_bodies: int) -> Float[Array, "m 3"]:
