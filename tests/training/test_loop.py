@@ -4,6 +4,7 @@ import concurrent.futures
 import dataclasses
 import shutil
 import signal
+import warnings
 from dataclasses import dataclass
 
 import jax
@@ -335,3 +336,21 @@ def test_coordinates_of_a_map_are_noted():
     far = dataclasses.replace(dataset, tx_positions=dataset.tx_positions + np.array([5e3, 0, 0]))
     with pytest.warns(UserWarning, match="holds coordinates of 5,.* m, where single precision is coarse"):
         check_data(far, get_field("wideband"))
+
+
+def test_transmitters_on_a_surface_are_counted():
+    """Half a millimetre behind a floor they are on both sides of it; two centimetres above it they are not."""
+    dataset = tiny_dataset()
+    corners = np.array([(-50, -50, 0), (50, -50, 0), (0, 50, 0)], np.float32)
+    mesh = dataclasses.replace(dataset, vertices=corners, faces=np.array([[0, 1, 2]], np.int32), face_part=None, materials=None)
+    places = mesh.tx_positions.copy()
+    places[:, 2] = 0.02
+    places[places[:, 0] == places[0, 0], 2] = -0.0005
+    count = len(np.unique(places[places[:, 2] < 0], axis=0))
+    on_it = dataclasses.replace(mesh, tx_positions=places)
+    with pytest.warns(UserWarning, match=f"{count} transmitters and 0 receivers lie on a surface"):
+        check_data(on_it, get_field("wave"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_data(on_it, get_field("wideband"))
+        check_data(dataclasses.replace(on_it, tx_positions=np.abs(places) + np.array([0, 0, 0.02])), get_field("wave"))

@@ -16,6 +16,8 @@ from wbgs_jax.mesh.bodies import ClosedBody, inside
 from wbgs_jax.radio.geometry import to_local
 from wbgs_jax.types import Mesh, Receiver, Surface, SurfaceSampling
 
+ON, MOST_COMPARED = 1e-3, 1_000_000_000
+"""Metres within which a point lies on a surface, and pairs of a point and a triangle that are compared at most (seconds)."""
 MESH_SIZED = (20_000, 70_000)
 """Bounds on the number of points if it is derived from the mesh."""
 
@@ -171,6 +173,22 @@ def in_sight(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Bool[np.ndarray,
         near = np.flatnonzero(((lowest <= line.max(0)) & (highest >= line.min(0))).all(1))  # a few percent of all
         free[i] = not len(near) or not _obstructed(line, triangles[near], normals[near])
     return free[which.reshape(-1)]
+
+
+def on_surfaces(dataset: Dataset, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Returns which points (metres) lie within `ON` of a surface; none where there are more than `MOST_COMPARED` pairs of a
+    point and a triangle."""
+    triangles, found = dataset.vertices[dataset.faces].astype(np.float64), np.zeros(len(points), bool)
+    if len(triangles) * len(points) > MOST_COMPARED:
+        return found
+    normals = trimesh.unitize(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]))
+    offsets, at_once = np.sum(normals * triangles[:, 0], -1), 4_000_000 // max(len(triangles), 1) + 1
+    for first in range(0, len(points), at_once):
+        near = np.abs(points[first : first + at_once] @ normals.T - offsets) < ON
+        point, triangle = np.nonzero(near & normals.any(-1))
+        inside = trimesh.triangles.points_to_barycentric(triangles[triangle], points[first + point]) >= 0
+        found[first + point[inside.all(1)]] = True
+    return found
 
 
 def _obstructed(

@@ -20,6 +20,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.config import Settings, limit_steps
 from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.scene import on_surfaces
 from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.observation_kinds import KINDS, Observations, Observed, spectra_of
 from wbgs_jax.radio.array import pas_directions, steering_vector
@@ -123,6 +124,15 @@ def check_data(dataset: Dataset, field: type[Field]) -> None:
             "mesh, transmitters and receivers",
             stacklevel=1,  # that of this line, so that the warning appears once
         )
+    if not knows_no_paths(dataset, field):
+        ends = np.unique(dataset.tx_positions, axis=0), np.asarray(dataset.receivers.position, np.float64)
+        transmitters, receivers = (int(on_surfaces(dataset, points).sum()) for points in ends)
+        if transmitters or receivers:
+            warnings.warn(
+                f"{dataset.name}: {transmitters} transmitters and {receivers} receivers lie on a surface of the mesh (within "
+                "1 mm), hence on both sides of it; move them or the surface by 2 mm",
+                stacklevel=1,
+            )
     if not dataset.has_spectra and "power" not in field.outputs:
         able, words = ", ".join(name for name in field_names() if "power" in get_field(name).outputs), dataset.observed.words
         raise UserError(f"{dataset.name} holds {words}, which the {field.name} field does not predict; choose one of: {able}")
