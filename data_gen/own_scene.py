@@ -72,7 +72,8 @@ def own_scene(
     """
     position, candidates = parse_point(rx, "--rx"), parse_transmitters(tx_grid)
     frequencies = tuple(frequencies_hz) or FREQUENCIES_HZ
-    objects, simulated = read_room(file, materials, up, scale), file.suffix.lower() == ".xml"
+    objects = read_room(file, materials, up, scale, antennas=np.concatenate([[position], candidates]))
+    simulated = file.suffix.lower() == ".xml"
     check_material_frequencies([one.slab.material for one in objects], frequencies)
     description = f"{len(objects)} objects of {file.name}"
     walls = {one.name: one.wall for one in objects if one.wall}

@@ -91,6 +91,17 @@ def test_a_wall_that_ended_at_the_face_that_is_gone_is_lengthened():
     np.testing.assert_allclose(long.bounds[:, 0], [14, 20])
 
 
+def test_the_face_towards_the_antennas_is_kept_where_the_middle_is_outside():
+    """The notch of an L-shaped building holds the middle of its box; a transmitter outside of that box counts for nothing."""
+    floor = block((-0.3, -0.3, -0.2), (10.3, 10.3, 0))
+    south, west = block((2, 2, 0), (10, 2.3, 3)), block((2, 2.3, 0), (2.3, 10, 3))
+    antennas = np.array([(1, 1, 1), (8, 1, 1), (1, 8, 1), (2.15, 15, 1)])
+    for places, kept in ((None, (2.3, 2.3)), (antennas, (2, 2))):
+        (_, first, second), walls = walls_as_sheets([floor, south, west], places)
+        assert walls == pytest.approx([0.2, 0.3, 0.3])
+        assert first.bounds[:, 1].tolist() == [kept[0]] * 2 and second.bounds[:, 0].tolist() == [kept[1]] * 2
+
+
 def test_bodies_that_are_no_walls_stay(rng):
     """A pillar, a table top, a ball, a hull, a wedge; a wall whose bodies are of two thicknesses."""
     wedge = trimesh.convex.convex_hull(

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from jaxtyping import Float
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import Room, load_room
@@ -30,7 +31,12 @@ class RoomObject:
 
 
 def read_room(
-    file: Path, materials: Path | None = None, up: str | None = None, scale: float | None = None, named: bool = True
+    file: Path,
+    materials: Path | None = None,
+    up: str | None = None,
+    scale: float | None = None,
+    named: bool = True,
+    antennas: Float[np.ndarray, "n 3"] | None = None,
 ) -> list[RoomObject]:
     """Returns the objects of a room in order of their names.
 
@@ -44,6 +50,8 @@ def read_room(
         scale: metres per unit of the file; by default the unit is the metre, and implausible sizes are rejected.
         named: whether all objects must have a material; otherwise, without `materials`, each has a material of its own, of
             unknown thickness.
+        antennas: positions of transmitters and receivers, metres, in the scene's z-up frame: of a wall's two faces the one
+            towards the nearest of them is kept, without them the one towards the middle of the scene.
 
     Raises:
         UserError: the file or the materials cannot be read, or the size is not that of a room.
@@ -59,7 +67,7 @@ def read_room(
     found = [RoomObject(one.name, one.mesh, slab) for one, slab in zip(objects, slabs, strict=True)]
     if simulated:
         return found
-    meshes, walls = walls_as_sheets([one.mesh for one in found])
+    meshes, walls = walls_as_sheets([one.mesh for one in found], antennas)
     return [_as_wall(one, mesh, wall) for one, mesh, wall in zip(found, meshes, walls, strict=True)]
 
 

@@ -2,7 +2,8 @@
 needs one surface with a slab of the wall's thickness.
 
 A wave that passes two surfaces, each a slab of the wall's thickness, would be attenuated twice. Of a thin closed body,
-therefore, only the face towards the middle of the room is kept, and the distance between its two faces is the thickness.
+therefore, only the face towards the nearest antenna is kept (towards the middle of the scene if there is none), and the
+distance between its two faces is the thickness.
 Surfaces that met are joined again: a panel in an opening moves into the plane of its wall, and a sheet that ended at a removed
 face is extended to the remaining one.
 """
@@ -51,18 +52,23 @@ class Sheet:
         return np.stack([first, np.cross(self.normal, first)])
 
 
-def walls_as_sheets(meshes: Sequence[trimesh.Trimesh]) -> tuple[list[trimesh.Trimesh], list[float]]:
+def walls_as_sheets(
+    meshes: Sequence[trimesh.Trimesh], antennas: Float[np.ndarray, "n 3"] | None = None
+) -> tuple[list[trimesh.Trimesh], list[float]]:
     """Returns the meshes of a room with those consisting only of walls converted to sheets, and the thickness of these walls.
 
     Args:
         meshes: metres, z up.
+        antennas: positions of transmitters and receivers, metres; those outside of the box around the scene are ignored.
 
     Returns:
         The meshes, and one thickness per mesh (metres), 0 for those that are not walls.
     """
     corners = np.concatenate([mesh.bounds for mesh in meshes])
-    centre = (corners.min(0) + corners.max(0)) / 2
-    walls = [_walls(mesh, centre) for mesh in meshes]
+    places = np.zeros((0, 3)) if antennas is None else antennas
+    places = places[((places > corners.min(0)) & (places < corners.max(0))).all(1)]
+    places = places if len(places) else (corners.min(0) + corners.max(0))[None] / 2
+    walls = [_walls(mesh, places) for mesh in meshes]
     if not any(walls):
         return list(meshes), [0.0] * len(meshes)
     single = [[] if own else _panels(mesh) for mesh, own in zip(meshes, walls, strict=True)]
@@ -74,18 +80,18 @@ def walls_as_sheets(meshes: Sequence[trimesh.Trimesh]) -> tuple[list[trimesh.Tri
     return results, [float(np.median([sheet.thickness for sheet in own])) if own else 0.0 for own in walls]
 
 
-def _walls(mesh: trimesh.Trimesh, centre: Float[np.ndarray, "3"]) -> list[Sheet]:
+def _walls(mesh: trimesh.Trimesh, places: Float[np.ndarray, "n 3"]) -> list[Sheet]:
     """Returns a sheet for every body of a mesh; none unless all bodies are walls of equal thickness within 10 %."""
     if not mesh.is_watertight:
         return []
-    found = [_wall(body, centre) for body in mesh.split(only_watertight=False)]
+    found = [_wall(body, places) for body in mesh.split(only_watertight=False)]
     sheets = [sheet for sheet in found if sheet is not None]
     thickness = [sheet.thickness for sheet in sheets]
     return sheets if sheets and len(sheets) == len(found) and max(thickness) < 1.1 * min(thickness) else []
 
 
-def _wall(body: trimesh.Trimesh, centre: Float[np.ndarray, "3"]) -> Sheet | None:
-    """Returns the face of a slab towards a point; None if the body is not a wall."""
+def _wall(body: trimesh.Trimesh, places: Float[np.ndarray, "n 3"]) -> Sheet | None:
+    """Returns the face of a slab towards the nearest of some points; None if the body is not a wall."""
     normals, areas = np.asarray(body.face_normals), np.asarray(body.area_faces)
     if len(normals) > MOST_FACES:
         return None
@@ -98,8 +104,12 @@ def _wall(body: trimesh.Trimesh, centre: Float[np.ndarray, "3"]) -> Sheet | None
     unequal = 0.02  # maximum relative difference between the areas of the two faces
     if not 0 < thickness <= thickest or abs(areas[top].sum() - areas[bottom].sum()) > unequal * areas[top].sum():
         return None
-    front = top if (centre - body.vertices.mean(0)) @ normal >= 0 else bottom
-    sheet = _sheet(body, front, normal, thickness)
+    sheet = _sheet(body, top, normal, thickness)
+    axes = np.stack([normal, *sheet.axes()])
+    own, others = body.vertices @ axes.T, places @ axes.T
+    away = np.maximum(np.maximum(own.min(0) - others, others - own.max(0)), 0)
+    if others[np.argmin(np.linalg.norm(away, axis=1)), 0] < own[:, 0].mean():
+        sheet = _sheet(body, bottom, normal, thickness)
     side = float(np.ptp(sheet.vertices @ sheet.axes().T, axis=0).min())
     # Metres: minimum of the smaller side of a vertical and of a horizontal slab. A table top stays a body with edges.
     smallest_wall, smallest_floor = 0.5, 2.0
