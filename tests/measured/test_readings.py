@@ -251,6 +251,28 @@ def test_numbers_that_stand_for_nothing_are_recognised(rng, number):
     np.testing.assert_array_equal(found[~nothing], heard[~nothing])
 
 
+@pytest.mark.parametrize("numbers", [(0.0, 100.0), (-110.0, -200.0), (99.0,), (-130.5, -300.0, 1.0)])
+def test_several_numbers_stand_for_nothing(rng, numbers):
+    heard = np.round(rng.uniform(-80, -40, (60, 3)), 1)
+    marked = heard.copy()
+    for k, number in enumerate(numbers):
+        marked[10 * k : 10 * k + 8] = number
+    with pytest.warns(UserWarning, match="is taken as not received"):
+        found = not_received(Path("t.csv"), marked)
+    np.testing.assert_array_equal(found, np.where(marked == heard, heard, np.nan))
+
+
+def test_readings_that_end_at_a_level_are_noted(rng):
+    heard = np.round(rng.normal(-82, 8, (200, 3)))
+    with pytest.warns(UserWarning, match="readings end at -80 dBm: weaker ones are missing"):
+        not_received(Path("t.csv"), np.maximum(heard, -80))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        not_received(Path("t.csv"), heard)
+        strong_once = np.concatenate([heard, [[-30.0, -30, -30]] * 5])  # beside a receiver
+        np.testing.assert_array_equal(not_received(Path("t.csv"), strong_once), strong_once)
+
+
 def test_weak_readings_are_readings(rng):
     heard = np.round(rng.uniform(-101, -40, (200, 3)))
     np.testing.assert_array_equal(not_received(Path("t.csv"), heard), heard)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from wbgs_jax._util.cli import parse_number
 from wbgs_jax._util.errors import UserError
@@ -146,27 +146,48 @@ DEGREES, TINY = (180.0, 90.0), 0.3
 
 
 def not_received(where: Path, powers: Float[np.ndarray, "n r"]) -> Float[np.ndarray, "n r"]:
-    """Returns powers with NaN in place of numbers that mean "not received"; a warning names these numbers."""
+    """Returns powers with NaN in place of numbers that mean "not received"; a warning names these numbers, and another one the
+    level below which readings are missing, if there is one (dBm)."""
     powers = np.where(np.isneginf(powers), np.nan, powers)
     # Numbers that devices write if they received nothing ...
     sentinels = (
         0.0, 1.0, 100.0, 127.0, 255.0,
         -100.0, -110.0, -120.0, -127.0, -128.0, -140.0, -150.0, -174.0, -199.0, -200.0, -999.0,
     )  # fmt: skip
-    apart_db = 8.0  # ... if all other values are at least this far to one side of them ...
+    apart_db = 8.0  # ... if they are this far from all other values, as any lowest number is, or highest above ...
+    strong_dbm, repeated = -10.0, 5  # ... this power (others are readings beside a receiver), that occurs this often; ...
     often = 0.2  # ... or if at least this fraction of the readings equals the lowest value.
-    for number in sentinels:
-        is_it = powers == number
-        others = powers[~np.isnan(powers) & ~is_it]
-        if not is_it.any() or not len(others):
-            continue
-        apart = number > others.max() + apart_db or number < others.min() - apart_db
-        floor = number < others.min() and is_it.sum() >= often * len(others)
-        if apart or floor:
-            share = is_it.sum() / powers.size
-            warnings.warn(f"{where}: {number:g} is taken as not received ({100 * share:.0f} % of the powers)", stacklevel=2)
-            powers = np.where(is_it, np.nan, powers)
-    return powers
+    while True:
+        values, counts = np.unique(powers[~np.isnan(powers)], return_counts=True)
+        for end, following in ((0, 1), (-1, -2)) if len(values) > 1 else ():
+            number, count = values[end], counts[end]
+            listed = number in sentinels
+            apart = abs(number - values[following]) > apart_db and (
+                listed or (count >= repeated and (end == 0 or number > strong_dbm))
+            )
+            floor = listed and end == 0 and count >= often * (counts.sum() - count)
+            if apart or floor:
+                share = 100 * count / powers.size
+                warnings.warn(f"{where}: {number:g} is taken as not received ({share:.0f} % of the powers)", stacklevel=2)
+                powers = np.where(powers == number, np.nan, powers)
+                break
+        else:
+            _note_cut(where, values, counts)
+            return powers
+
+
+def _note_cut(where: Path, values: Float[np.ndarray, " v"], counts: Int[np.ndarray, " v"]) -> None:
+    """Warns of different powers (dBm, ascending) and their counts if many readings equal the lowest one."""
+    next_db, factor, share = 3.0, 3.0, 0.1  # more than three times the readings in the next 3 dB, and a tenth of all
+    if len(values) < 2:
+        return
+    above = counts[1:][values[1:] <= values[0] + next_db].sum()
+    if counts[0] > factor * above and counts[0] >= share * counts.sum() and counts[0] > 1:
+        warnings.warn(
+            f"{where}: readings end at {values[0]:g} dBm: weaker ones are missing, so that the map is too high there; "
+            "leave cells empty where nothing was received",
+            stacklevel=3,
+        )
 
 
 def check_powers(where: Path, powers: Float[np.ndarray, "n r"]) -> None:
