@@ -302,6 +302,22 @@ def test_a_room_for_every_reading_is_refused(tmp_path, rng):
         load_survey(tmp_path)
 
 
+def test_larger_cells_do_not_average_storeys(tmp_path, rng):
+    (tmp_path / "receivers.csv").write_text("id,x,y,z\n1,0,0,2\n")
+    plane = rng.uniform(0, 200, (4000, 2)).round(2)
+    for heights, refused in ((rng.choice([1.3, 4.3, 7.3], 4000), False), (np.linspace(0, 2000, 4000), True)):
+        write_table(
+            tmp_path / "readings.csv", ["x", "y", "z", "rssi_1"], np.column_stack([plane, heights, -60 - plane[:, 0] / 9])
+        )
+        if refused:
+            with pytest.raises(UserError, match=r"heights z give at least 20\d\d cells of 1 m"):
+                load_survey(tmp_path)
+        else:
+            survey = load_survey(tmp_path)
+            assert survey.cell_m > 4
+            np.testing.assert_allclose(np.unique(survey.cells.places[:, 2].round(6)), [1.3, 4.3, 7.3])
+
+
 def test_floors_part_readings_as_rooms_do(tmp_path):
     (tmp_path / "receivers.csv").write_text("id,x,y,z\n1,0,0,2\n2,5,5,2\n")
     (tmp_path / "readings.csv").write_text("time,x,y,z,floor,room,2,1\nnoon,1,1,1.2,0,a,-50,-60\nnow,1,1,4.2,1,a,-70,-80\n")

@@ -224,19 +224,20 @@ def _checked(readings: Readings, folder: Path) -> Readings:
     return readings
 
 
-def cell_means(readings: Readings, size: float) -> Readings:
+def cell_means(readings: Readings, size: float, highest: float = np.inf) -> Readings:
     """Returns means (of dBm) over cubic cells, which average out fading. The position of a cell is the mean position of its
     readings; a cell that extends over two rooms is divided.
 
     Args:
         readings: to average.
         size: of a cell, metres.
+        highest: maximum height of a cell, metres.
 
     Returns:
         One reading per cell.
     """
     names, room = np.unique(np.array(readings.rooms), return_inverse=True)
-    cubes = np.column_stack([np.floor(readings.places / size).astype(int), room.reshape(-1)])
+    cubes = np.column_stack([np.floor(readings.places / [size, size, min(size, highest)]).astype(int), room.reshape(-1)])
     cubes, cell = np.unique(cubes, axis=0, return_inverse=True)
     cell, n = cell.reshape(-1), len(cubes)
     received = np.isfinite(readings.powers)

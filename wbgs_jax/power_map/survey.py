@@ -15,6 +15,8 @@ HEIGHT_M = 1.3
 """Height of the transmitters above the floor if the readings have no z."""
 CELL_M = 0.25
 """Side of the cells over which readings are averaged."""
+STOREY_M = 1.0
+"""Maximum height of enlarged cells: higher ones average storeys, metres."""
 BEYOND_M = 2.0
 """Distance (metres) from readings, receivers and walls up to which predictions have an interval: it includes the next room, not
 the next building."""
@@ -48,11 +50,12 @@ def load_survey(folder: Path, height_m: float = HEIGHT_M, cell_m: float = CELL_M
     Args:
         folder: the folder.
         height_m: height of the transmitters above the floor if the readings have no z.
-        cell_m: side of the cells. It is doubled until their number is within the limit of a map (`MAX_PLACES`).
+        cell_m: side of the cells. It is doubled until their number is within the limit of a map (`MAX_PLACES`), but in height
+            not beyond one metre, so that storeys are not averaged.
         floor_plan: the file of the walls; by default the one in the folder.
 
     Raises:
-        UserError: a file is missing or cannot be read, or there are too many rooms.
+        UserError: a file is missing or cannot be read, or there are too many rooms or heights.
     """
     readings = load_readings(folder, height_m)
     largest_m = 1e5  # side of cells that hold everything but other rooms and other signs of coordinates
@@ -61,10 +64,15 @@ def load_survey(folder: Path, height_m: float = HEIGHT_M, cell_m: float = CELL_M
             f"{folder}: readings of {len(set(readings.rooms))} rooms give at least {fewest} cells, but a map has at most "
             f"{MAX_PLACES}; name the room, not the reading, in the columns of rooms and floors, or leave them out"
         )
+    if (fewest := len(cell_means(readings, largest_m, STOREY_M).places)) > MAX_PLACES:
+        raise UserError(
+            f"{folder}: heights z give at least {fewest} cells of {STOREY_M:g} m, but a map has at most {MAX_PLACES}; divide "
+            "the readings by storey or by part of the building"
+        )
     cells = cell_means(readings, cell_m)
     while len(cells.places) > MAX_PLACES:
         cell_m *= 2
-        cells = cell_means(readings, cell_m)
+        cells = cell_means(readings, cell_m, STOREY_M)
     return Survey(cells, cell_m, find_walls(folder, floor_plan))
 
 
