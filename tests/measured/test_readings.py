@@ -302,6 +302,24 @@ def test_a_room_for_every_reading_is_refused(tmp_path, rng):
         load_survey(tmp_path)
 
 
+@pytest.mark.parametrize(("scale", "offset"), [(100.0, 0.0), (1.0, 40.0), (30.0, -20.0)])
+def test_floor_plans_in_another_unit_or_frame_are_refused(tmp_path, rng, scale, offset):
+    folder(tmp_path, rng, n=30)
+    write_table(tmp_path / "walls.csv", ["x1", "y1", "x2", "y2"], [[0.5, 0, 0.5, 1]])
+    assert len(load_survey(tmp_path).walls.ends) == 1  # one wall among the readings
+    outline = np.array([[0.0, 0], [8, 0], [8, 4], [0, 4]])
+    write_table(tmp_path / "walls.csv", ["x", "y"], scale * outline + offset)
+    with pytest.raises(UserError, match=r"floor plan of .* % of the readings lie in its .*; give the plan in metres"):
+        load_survey(tmp_path)
+
+
+def test_walls_of_an_unmeasured_wing_do_not_extend_the_domain(tmp_path, rng):
+    folder(tmp_path, rng, n=30)
+    write_table(tmp_path / "walls.csv", ["x1", "y1", "x2", "y2"], [[-1, 0, -1, 4], [0, 4, 38, 4]])
+    box = load_survey(tmp_path).domain.box
+    assert box[0, 0] == -1 and 17 < box[1, 0] < 18
+
+
 def test_larger_cells_do_not_average_storeys(tmp_path, rng):
     (tmp_path / "receivers.csv").write_text("id,x,y,z\n1,0,0,2\n")
     plane = rng.uniform(0, 200, (4000, 2)).round(2)

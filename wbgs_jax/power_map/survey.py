@@ -35,12 +35,15 @@ class Survey:
 
     @property
     def domain(self) -> Domain:
-        """The measured domain: the box around readings, receivers and walls."""
+        """The measured domain: the box around readings, receivers and walls, of which those of unmeasured wings extend it by at
+        most 10 m."""
         points = np.concatenate([self.cells.places, self.cells.receivers])
         low, high = points.min(0), points.max(0)
         ends = np.asarray(self.walls.ends).reshape(-1, 2)
         if len(ends):
-            low[:2], high[:2] = np.minimum(low[:2], ends.min(0)), np.maximum(high[:2], ends.max(0))
+            most = 10.0  # metres by which walls extend the box
+            low[:2] = np.clip(ends.min(0), low[:2] - most, low[:2])
+            high[:2] = np.clip(ends.max(0), high[:2], high[:2] + most)
         return Domain("the readings", np.stack([low, high]), (0.0, np.inf), BEYOND_M)
 
 
@@ -55,7 +58,8 @@ def load_survey(folder: Path, height_m: float = HEIGHT_M, cell_m: float = CELL_M
         floor_plan: the file of the walls; by default the one in the folder.
 
     Raises:
-        UserError: a file is missing or cannot be read, or there are too many rooms or heights.
+        UserError: a file is missing or cannot be read, there are too many rooms or heights, or the floor plan is of another
+            place or unit.
     """
     readings = load_readings(folder, height_m)
     largest_m = 1e5  # side of cells that hold everything but other rooms and other signs of coordinates
@@ -73,7 +77,28 @@ def load_survey(folder: Path, height_m: float = HEIGHT_M, cell_m: float = CELL_M
     while len(cells.places) > MAX_PLACES:
         cell_m *= 2
         cells = cell_means(readings, cell_m, STOREY_M)
-    return Survey(cells, cell_m, find_walls(folder, floor_plan))
+    walls = find_walls(folder, floor_plan)
+    _check_plan(f"floor plan of {folder}" if floor_plan is None else f"floor plan {floor_plan}", walls, cells)
+    return Survey(cells, cell_m, walls)
+
+
+def _check_plan(what: str, walls: Walls, cells: Readings) -> None:
+    """Raises a `UserError` if a floor plan neither surrounds the readings nor lies among them, as one in centimetres or in
+    another frame."""
+    if not len(walls.ends):
+        return
+    ends, places = np.asarray(walls.ends, float).reshape(-1, 2), cells.places[:, :2]
+    points = np.concatenate([places, cells.receivers[:, :2]])
+    margin, largest_ratio = 2.0, 5.0  # metres around a box; and largest ratio of the plan's diagonal to that of the readings
+    inside = np.all((places >= ends.min(0) - margin) & (places <= ends.max(0) + margin), 1).mean()
+    among = np.all((ends >= points.min(0) - margin) & (ends <= points.max(0) + margin))
+    plan, site = np.ptp(ends, axis=0), np.ptp(points, axis=0)
+    elsewhere = inside < 0.5 and not among
+    if elsewhere or np.linalg.norm(plan) > largest_ratio * max(float(np.linalg.norm(site)), margin):
+        raise UserError(
+            f"{what}: {100 * inside:.0f} % of the readings lie in its {plan[0]:.3g} x {plan[1]:.3g} m, and readings and "
+            f"receivers span {site[0]:.3g} x {site[1]:.3g} m; give the plan in metres, in their frame, without distant parts"
+        )
 
 
 def find_walls(folder: Path | None, floor_plan: Path | None) -> Walls:
