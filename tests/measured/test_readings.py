@@ -320,6 +320,14 @@ def test_walls_of_an_unmeasured_wing_do_not_extend_the_domain(tmp_path, rng):
     assert box[0, 0] == -1 and 17 < box[1, 0] < 18
 
 
+def test_places_where_nothing_was_received_are_not_measured(tmp_path, rng):
+    folder(tmp_path, rng, n=30, rooms=False)
+    path = tmp_path / "readings.csv"
+    path.write_text(path.read_text() + "30,1,,,\n")
+    survey = load_survey(tmp_path)
+    assert survey.domain.box[1, 0] < 8 and survey.measured[:, 0].max() < 8 < survey.cells.places[:, 0].max()
+
+
 def test_larger_cells_do_not_average_storeys(tmp_path, rng):
     (tmp_path / "receivers.csv").write_text("id,x,y,z\n1,0,0,2\n")
     plane = rng.uniform(0, 200, (4000, 2)).round(2)

@@ -129,7 +129,7 @@ def of_run(command: Command, places: Float[np.ndarray, "c 3"]) -> State:
 
 
 def of_readings(command: Command, places: Float[np.ndarray, "c 3"]) -> State:
-    """Returns the state of a map fitted to readings: mean standard deviations over receivers, and the places of the cells."""
+    """Returns the state of a map fitted to readings: mean standard deviations over receivers, and the measured places."""
     import jax
     import jax.numpy as jnp
 
@@ -142,7 +142,7 @@ def of_readings(command: Command, places: Float[np.ndarray, "c 3"]) -> State:
     learned = learn_map(survey.cells, survey.walls)
     _, std = jax.jit(received_power)(learned, jnp.asarray(places, jnp.float32))
     outside = survey.domain.outside(places)
-    return State(np.asarray(survey.cells.places, float), np.where(outside, np.nan, np.asarray(std).mean(1)), "dB", ALIKE_M)
+    return State(np.asarray(survey.measured, float), np.where(outside, np.nan, np.asarray(std).mean(1)), "dB", ALIKE_M)
 
 
 def choose(command: Command) -> None:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.floor_plan import FILES, NO_WALLS, Walls, load_walls
@@ -34,10 +35,15 @@ class Survey:
     """Walls of the floor plan; none without one."""
 
     @property
+    def measured(self) -> Float[np.ndarray, "m 3"]:
+        """The positions of the cells in which something was received, metres."""
+        return self.cells.places[np.isfinite(self.cells.powers).any(1)]
+
+    @property
     def domain(self) -> Domain:
         """The measured domain: the box around readings, receivers and walls, of which those of unmeasured wings extend it by at
         most 10 m."""
-        points = np.concatenate([self.cells.places, self.cells.receivers])
+        points = np.concatenate([self.measured, self.cells.receivers])
         low, high = points.min(0), points.max(0)
         ends = np.asarray(self.walls.ends).reshape(-1, 2)
         if len(ends):
