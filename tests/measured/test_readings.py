@@ -346,10 +346,12 @@ def test_larger_cells_do_not_average_storeys(tmp_path, rng):
 
 def test_floors_part_readings_as_rooms_do(tmp_path):
     (tmp_path / "receivers.csv").write_text("id,x,y,z\n1,0,0,2\n2,5,5,2\n")
-    (tmp_path / "readings.csv").write_text("time,x,y,z,floor,room,2,1\nnoon,1,1,1.2,0,a,-50,-60\nnow,1,1,4.2,1,a,-70,-80\n")
+    (tmp_path / "readings.csv").write_text(
+        "time,x,y,z,floor,room,2,1\nnoon,1,1,1.2,0,a,-50,-60\nnow,1,1,4.2,1,a,-70,-80\n,2,1,1,,,-70,-80\n"
+    )
     readings = load_readings(tmp_path, HEIGHT)
-    assert readings.rooms == ("a/0", "a/1")
-    np.testing.assert_array_equal(readings.powers, [[-60, -50], [-80, -70]])
+    assert readings.rooms == ("a/0", "a/1", "")
+    np.testing.assert_array_equal(readings.powers[:2], [[-60, -50], [-80, -70]])
 
 
 def test_gateways_are_found_by_their_names(tmp_path):

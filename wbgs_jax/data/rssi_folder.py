@@ -207,7 +207,7 @@ def _load_tables(folder: Path, height: float) -> Readings:
         raise UserError(f"{path} has a column of floors but no heights; add the column z, metres in the receivers' frame")
     if places.shape[1] == 2:
         places = np.column_stack([places, np.full(len(places), height)])
-    rooms = tuple("/".join(row[part] for part in parts) for row in rows)
+    rooms = tuple("/".join(row[part] for part in parts if row[part]) for row in rows)
     values = not_received(path, numbers(path, header, rows, powers))
     check_powers(path, values)
     return Readings(places, values, np.isfinite(values).astype(float), rooms, receivers)
