@@ -14,7 +14,18 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.floor_plan import NO_WALLS, Walls
 from wbgs_jax.data.rssi_folder import Readings
 from wbgs_jax.power_map.model import LENGTH, MAX_PLACES, Scales, learn_map, received_power
-from wbgs_jax.power_map.validation import FOLDS, NINETY, folds, inverse_distance, kriging, log_distance, scores, wrong_plans
+from wbgs_jax.power_map.validation import (
+    FOLDS,
+    NINETY,
+    _rooms,
+    _usable,
+    folds,
+    inverse_distance,
+    kriging,
+    log_distance,
+    scores,
+    wrong_plans,
+)
 
 GUIDE = Path(__file__).parents[2] / "docs" / "measured.md"
 WALLS = Walls(WALL, np.ones(1))
@@ -178,6 +189,25 @@ def test_squares_are_held_out_once_each(rng):
         for part in parts:
             inside = {tuple(own) for own in square[part]}
             assert not inside & {tuple(own) for own in square[~part]}
+
+
+def test_many_rooms_are_held_out_in_groups(rng):
+    tx = places(rng, 300)
+    cells = dataclasses.replace(readings(tx, powers(tx)), rooms=tuple(f"{k % 23}" for k in range(300)))
+    ((name, parts),) = _rooms(cells)
+    assert name == "23 rooms in 10 groups" and len(parts) == 10 and (np.sum(parts, 0) == 1).all()
+    rooms = np.array(cells.rooms)
+    for part in parts:
+        assert not set(rooms[part]) & set(rooms[~part])
+
+
+def test_parts_without_which_too_little_remains_are_not_held_out(rng):
+    tx = np.concatenate([rng.uniform(0.1, 0.9, (30, 3)), [[5.5, 1.5, 1.3], [7.5, 1.5, 1.3]]])
+    cells = readings(tx, powers(tx))
+    assert [part.sum() for part in _usable(folds(cells), cells)] == [1, 1]
+    few = readings(tx[-4:], powers(tx[-4:]))
+    with pytest.raises(UserError, match=r"12 mean powers are too few for holding any out: at least 10 must remain"):
+        scores(few, NO_WALLS)
 
 
 def test_what_cannot_be_learned_is_said(rng):

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.progress_lines import CountProgress
 from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.data.floor_plan import NO_WALLS, Walls, crossings
 from wbgs_jax.data.rssi_folder import Readings
@@ -25,6 +26,8 @@ from wbgs_jax.power_map.model import APART, MIN_POWERS, NEAREST, Scales, alike, 
 
 BLOCK, FOLDS = 1.0, 40
 """Side of the held-out squares, metres; and the maximum number of folds, into which several squares are combined."""
+ROOMS = 10
+"""Maximum number of rooms that are held out one at a time; more are combined into as many groups of whole rooms."""
 NINETY = 1.6449
 """Half width of the 90 % interval of a normal distribution, in standard deviations."""
 Parts = list[Bool[np.ndarray, " n"]]
@@ -52,19 +55,34 @@ class Score:
 
 
 def scores(cells: Readings, walls: Walls) -> list[Score]:
-    """Returns the scores of a map with walls and of its baselines, holding out one room at a time and then squares of one
-    metre.
+    """Returns the scores of a map with walls and of its baselines, holding out one room at a time (one group of rooms, if there
+    are more than `ROOMS`) and then squares of one metre. Parts without which too little remains to learn from are not scored.
 
     Raises:
-        UserError: all powers are from one square metre, so that nothing can be held out.
+        UserError: all powers are from one square metre, or too few, so that nothing can be held out.
     """
-    rooms = [room for room in dict.fromkeys(cells.rooms) if room]
-    splits = [(f"room {room}", [np.array([own == room for own in cells.rooms])]) for room in rooms]
-    splits.append((f"squares of {BLOCK:g} m", folds(cells)))
+    splits = [*_rooms(cells), (f"squares of {BLOCK:g} m", folds(cells))]
     usable = [(name, scored) for name, parts in splits if (scored := _usable(parts, cells))]
-    if not usable:
+    received = np.isfinite(cells.powers)
+    if not usable and len(np.unique(squares(cells)[received.any(1)])) == 1:
         raise UserError(f"all powers lie within {BLOCK:g} m, so nothing can be held out")
-    return [_score(name, parts, cells, walls) for name, parts in usable]
+    if not usable:
+        raise UserError(f"{received.sum()} mean powers are too few for holding any out: at least {MIN_POWERS} must remain")
+    with CountProgress("held out", len(usable)) as progress:
+        found = []
+        for name, parts in usable:
+            found.append(_score(name, parts, cells, walls))
+            progress.advance()
+    return found
+
+
+def _rooms(cells: Readings) -> list[tuple[str, Parts]]:
+    """Returns the rooms by name as parts to hold out, or groups of them, of one name together."""
+    names = [room for room in dict.fromkeys(cells.rooms) if room]
+    rooms = [np.array([own == name for own in cells.rooms]) for name in names]
+    if len(rooms) <= ROOMS:
+        return [(f"room {name}", [room]) for name, room in zip(names, rooms, strict=True)]
+    return [(f"{len(rooms)} rooms in {ROOMS} groups", [np.any(rooms[first::ROOMS], 0) for first in range(ROOMS)])]
 
 
 def folds(cells: Readings) -> Parts:
@@ -81,10 +99,9 @@ def squares(cells: Readings) -> Int[np.ndarray, " n"]:
 
 
 def _usable(parts: Parts, cells: Readings) -> Parts:
-    """Returns the parts in which something was received; none if leaving one out leaves too little to learn from."""
+    """Returns the parts in which something was received, and without which enough remains to learn from."""
     received = np.isfinite(cells.powers)
-    scored = [part for part in parts if received[part].any()]
-    return scored if all(received[~part].sum() >= MIN_POWERS for part in scored) else []
+    return [part for part in parts if received[part].any() and received[~part].sum() >= MIN_POWERS]
 
 
 def _score(name: str, parts: Parts, cells: Readings, walls: Walls) -> Score:
