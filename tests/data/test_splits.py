@@ -1,6 +1,7 @@
 """Splits never cut through a transmitter."""
 
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
@@ -15,12 +16,14 @@ from wbgs_jax.data.splits import (
     group_transmitters,
     hold_out_box,
     hold_out_validation,
+    note_shared_transmitters,
     select_frequencies,
     select_receivers,
     tx_disjoint_split,
     unseen_frequencies,
     without_test,
 )
+from wbgs_jax.training.fit_kriging import spacing
 from wbgs_jax.types import make_receiver, stack_receivers
 
 
@@ -261,3 +264,19 @@ def test_transmitters_that_no_chosen_receiver_hears_are_gone():
 def test_receivers_that_are_not_there(three, which):
     with pytest.raises(UserError, match="box has receivers 0 to 2; choose each once"):
         select_receivers(three, which)
+
+
+def test_repeated_positions_with_jitter_are_noted(rng):
+    places = rng.uniform(0, 6, (40, 3))
+    repeated = np.repeat(places, 10, 0) + rng.normal(0, 1e-3, (400, 3))
+    for positions, noted in ((repeated, True), (rng.uniform(0, 6, (400, 3)), False)):
+        tx = group_transmitters(positions)
+        train, test = tx_disjoint_split(tx)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            note_shared_transmitters("mine", tx, {"train": train, "test": test}, positions)
+        assert [str(one.message).startswith("mine: 100 % of the test's TX positions lie within 1 cm") for one in caught] == (
+            [True] if noted else []
+        )
+    np.testing.assert_allclose(spacing(repeated), spacing(places), rtol=0.1)
+    assert spacing(places[:2] * 1e-4) < 1e-3

@@ -173,7 +173,7 @@ def load_layout(
     tx_index = group_transmitters(positions)
     room = _read_room(folder)
     if any((folder / name).exists() for name in INDEX.values()):
-        split = _read_split(folder, tx_index)
+        split = _read_split(folder, tx_index, positions)
     else:
         train, test = tx_disjoint_split(tx_index, test_fraction, seed)
         split = {"train": train, "validation": train[:0], "test": test}
@@ -353,7 +353,7 @@ def _inferred(
     return found.convention
 
 
-def _read_split(folder: Path, tx_index: np.ndarray) -> dict[str, np.ndarray]:
+def _read_split(folder: Path, tx_index: np.ndarray, positions: np.ndarray) -> dict[str, np.ndarray]:
     """Returns the indices of every part of the split; only the validation may be missing."""
     optional = [] if (folder / INDEX["validation"]).exists() else ["validation"]
     split = {p: np.zeros(0, int) if p in optional else _read_index(folder / INDEX[p], len(tx_index)) for p in INDEX}
@@ -361,7 +361,7 @@ def _read_split(folder: Path, tx_index: np.ndarray) -> dict[str, np.ndarray]:
         both = np.intersect1d(split[first], split[second])
         if len(both):
             raise UserError(f"image {both[0] + 1:05d} is in both {folder / INDEX[first]} and {INDEX[second]}; keep it in one")
-    note_shared_transmitters(str(folder), tx_index, split)
+    note_shared_transmitters(str(folder), tx_index, split, positions)
     return split
 
 

@@ -222,7 +222,7 @@ def scene_dataset(scene: SceneFile) -> Dataset:
     split = scene.split[tx]
     tx_index = group_transmitters(scene.tx_positions[tx])
     parts = {name: np.flatnonzero(split == code) for name, code in PARTS.items()}
-    note_shared_transmitters(scene.name, tx_index, parts)
+    note_shared_transmitters(scene.name, tx_index, parts, scene.tx_positions[tx])
     dataset = Dataset(
         name=scene.name,
         receivers=stack_receivers(_receivers(scene)),

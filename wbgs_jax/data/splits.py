@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
@@ -27,12 +28,27 @@ def group_transmitters(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "
     return np.argsort(np.argsort(first))[group.reshape(-1)]
 
 
-def note_shared_transmitters(name: str, tx_index: Int[np.ndarray, " n"], split: Mapping[str, Int[np.ndarray, " k"]]) -> None:
-    """Warns of transmitters with links in two parts of a split."""
+def note_shared_transmitters(
+    name: str,
+    tx_index: Int[np.ndarray, " n"],
+    split: Mapping[str, Int[np.ndarray, " k"]],
+    positions: Float[np.ndarray, "n 3"],
+) -> None:
+    """Warns of transmitters with links in two parts of a split, and of test positions (metres) almost at training positions."""
     for first, second in itertools.combinations(split, 2):
         if shared := len(np.intersect1d(tx_index[split[first]], tx_index[split[second]])):
             text = f"{name}: {shared} TX positions are both in {first} and in {second}; scores will be too high"
             warnings.warn(text, stacklevel=4)
+    own, others = (np.unique(positions[split[part]], axis=0) for part in ("test", "train"))
+    # Distance of a repeated position, and fraction and number of test positions that may be repeated.
+    apart_m, few, fewest = 1e-2, 0.1, 4
+    if len(own) > fewest and len(others):
+        away, _ = cKDTree(others).query(own)
+        # Positions that agree to a micrometre belong to one transmitter (the first warning).
+        repeated = (away < apart_m) & (away > 1e-6)
+        if repeated.sum() > fewest and repeated.mean() > few:
+            text = f"{name}: {100 * repeated.mean():.0f} % of the test's TX positions lie within 1 cm of one in train"
+            warnings.warn(f"{text}; scores will be too high: give all of them the same position", stacklevel=4)
 
 
 def tx_disjoint_split(

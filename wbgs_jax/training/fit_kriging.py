@@ -142,8 +142,17 @@ def choices(dataset: Dataset, known: Int[np.ndarray, " n"]) -> list[Choice]:
 
 
 def spacing(places: Float[np.ndarray, "n 3"]) -> float:
-    """Returns the median distance (metres) between a place and the nearest other, of at least two different places."""
-    return float(np.median(cKDTree(places).query(places, 2)[0][:, 1]))
+    """Returns the median distance (metres) between a place and the nearest other, of at least two different places; places
+    within a centimetre count as one, unless all of them are."""
+    same_m = 1e-2
+    nearest = cKDTree(places).query(places, 2)[0][:, 1]
+    if nearest.min() >= same_m:
+        return float(np.median(nearest))
+    _, first = np.unique(np.round(places / same_m), axis=0, return_index=True)
+    most = 9  # one place may be rounded to eight
+    away = cKDTree(places[first]).query(places[first], most)[0]
+    others = np.where(away >= same_m, away, np.inf).min(1)
+    return float(np.median(others if np.isfinite(others).all() else nearest))
 
 
 def choose(tried: dict[Choice, Float[np.ndarray, " n"]], tx_index: Int[np.ndarray, " n"]) -> tuple[Choice | None, float]:
