@@ -1,5 +1,6 @@
 """A survey: readings of a folder as means over small cells, with the walls of the floor plan and the measured domain."""
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -85,6 +86,14 @@ def load_survey(folder: Path, height_m: float = HEIGHT_M, cell_m: float = CELL_M
         cells = cell_means(readings, cell_m, STOREY_M)
     walls = find_walls(folder, floor_plan)
     _check_plan(f"floor plan of {folder}" if floor_plan is None else f"floor plan {floor_plan}", walls, cells)
+    heights = np.concatenate([cells.places[:, 2], cells.receivers[:, 2]])
+    one_storey = 2.5  # metres: largest difference of heights within one storey
+    if np.ptp(heights) > one_storey:
+        warnings.warn(
+            f"{folder}: heights z range over {np.ptp(heights):.2g} m, but ceilings between storeys do not attenuate in a map; "
+            "use readings and receivers of one storey",
+            stacklevel=2,
+        )
     return Survey(cells, cell_m, walls)
 
 
