@@ -41,7 +41,7 @@ def readings(tx, heard):
 def test_a_law_without_noise_is_found_and_holds_everywhere(rng):
     tx = places(rng, 250)
     learned = learn_map(readings(tx, powers(tx)), WALLS)
-    np.testing.assert_allclose(learned.law, np.tile(LAW, (3, 1)), atol=0.5)
+    np.testing.assert_allclose(learned.law, LAW, atol=0.5)
     far = places(rng, 50)
     mean, std = jax.jit(received_power)(learned, jnp.asarray(far, jnp.float32))
     assert np.abs(mean - powers(far)).mean() < 0.3
@@ -83,10 +83,10 @@ def test_the_covariance_is_that_of_the_formula(rng):
             return np.exp(-distance / LENGTH) * (scales.room**2 + scales.wall**2 * np.outer(phi(a)[:, 2], phi(b)[:, 2]))
 
         inverse = np.linalg.inv(k(tx[own], tx[own]) + (scales.place**2 + scales.reading**2) * np.eye(own.sum()))
-        left = heard[own, r] - phi(tx[own]) @ law[r]
-        np.testing.assert_allclose(mean[:, r], phi(asked) @ law[r] + k(asked, tx[own]) @ inverse @ left, atol=2e-3)
+        left = heard[own, r] - phi(tx[own]) @ law
+        np.testing.assert_allclose(mean[:, r], phi(asked) @ law + k(asked, tx[own]) @ inverse @ left, atol=2e-3)
         variance = np.diag(k(asked, asked) - k(asked, tx[own]) @ inverse @ k(tx[own], asked))
-        variance = variance + np.einsum("bi,ij,bj->b", phi(asked), covariance[r], phi(asked))
+        variance = variance + np.einsum("bi,ij,bj->b", phi(asked), covariance, phi(asked))
         np.testing.assert_allclose(std[:, r], np.sqrt(variance), rtol=2e-3)
 
 
@@ -104,18 +104,6 @@ def test_intervals_hold_nine_in_ten(rng):
         mean, std = (np.asarray(a) for a in received_power(learned, jnp.asarray(tx[180:], jnp.float32)))
         held, total = held + (np.abs(mean - local[180:]) <= NINETY * std).sum(), total + mean.size
     assert 0.82 < held / total < 0.97, held / total
-
-
-@pytest.mark.heavy
-@pytest.mark.parametrize("gains", [(0.0, 0.0, 0.0), (12.0, -10.0, 3.0)])
-def test_receivers_of_other_gains_are_predicted_in_the_next_room(rng, gains):
-    """Walls are known, offsets are not."""
-    tx = places(rng, 200)
-    heard, east = powers(tx, 3.0, rng) + np.array(gains), tx[:, 0] > 4
-    learned = learn_map(readings(tx, heard).without(east), WALLS, Scales(room=2.0, wall=0.5, place=0.1, reading=3.0))
-    mean, std = (np.asarray(a) for a in received_power(learned, jnp.asarray(tx[east], jnp.float32)))
-    off = np.abs(mean - heard[east])
-    assert (off <= NINETY * np.sqrt(std**2 + 9)).mean() > 0.8 and off.mean() < 4.5, off.mean()
 
 
 @pytest.mark.heavy

@@ -117,15 +117,13 @@ def answers(learned: PowerMap, places: Float[np.ndarray, "tx 3"], where: Domain)
 
 def report(learned: PowerMap, found: list[Score], command: Command, size: float) -> dict[str, Any]:
     """Returns the content of a results file."""
-    law, scales = np.asarray(learned.law, float), np.asarray(learned.scales, float).round(4).tolist()
-    common = law.mean(0)
+    law, scales = (np.asarray(a, float).round(4).tolist() for a in (learned.law, learned.scales))
     assert command.data is not None, "checked"
     return {
         "data": command.data.resolve().name,
         "attribution": attribution(command.data),
         "cell_m": size,
-        "law": dict(zip(("dbm_at_one_metre", "exponent", "first_wall_db"), common.round(4).tolist(), strict=True)),
-        "offsets_db": (law[:, 0] - common[0]).round(4).tolist(),
+        "law": dict(zip(("dbm_at_one_metre", "exponent", "first_wall_db"), law, strict=True)),
         "scales_db": dict(zip(("room", "wall", "place", "reading"), scales, strict=True)),
         "scores": {_key(score.held_out): _as_json(score) for score in found},
         "environment": environment(),

@@ -1,13 +1,12 @@
 """Received power, averaged over fading, as a function of the transmitter's position: a path loss law with distance and walls,
 and a Gaussian process for its residuals.
 
-    P_r(x) = a + g_r - 10 n log10 d - l sqrt(w) + u_r(x) + sqrt(w) v_r(x)
+    P_r(x) = a - 10 n log10 d - l sqrt(w) + u_r(x) + sqrt(w) v_r(x)
 
-with g_r the offset of receiver r, d the distance to it and w the number of walls in between. Further walls cost less than the
-first one, since waves through doors and around corners do not cross them (compare the multi-wall model of COST 231, final
-report, section 4.7, with its decreasing loss of further floors). The law is common to all receivers but for their offsets
-(gains of antennas and radios), random effects of mean 0. It is fitted by least squares, in which the readings of one square
-metre count as one, so that it holds where nothing was measured. The residuals u and v, due to rooms and individual
+with d the distance to receiver r and w the number of walls in between. Further walls cost less than the first one, since waves
+through doors and around corners do not cross them (compare the multi-wall model of COST 231, final report, section 4.7, with
+its decreasing loss of further floors). The law is common to all receivers and fitted by least squares, in which the readings of
+one square metre count as one, so that it holds where nothing was measured. The residuals u and v, due to rooms and individual
 walls, decay with the distance from the measurements (exponential covariance; Rasmussen and Williams 2006, chapter 2).
 """
 
@@ -32,10 +31,6 @@ LAW = np.array([-45.0, 2.0, 6.0])
 """Prior means of the power at one metre (dBm), the exponent and the loss of a wall (dB), ..."""
 LAW_WIDTH = np.array([30.0, 1.0, 4.0])
 """... and their prior standard deviations."""
-OFFSETS = np.geomspace(0.5, 20.0, 38)
-"""Standard deviations of the offsets of receivers (dB), of which the one of maximum posterior probability is used, ..."""
-OFFSET = 6.0
-"""... and their prior median, dB; the logarithm has a prior standard deviation of 1, since units of one kind are alike."""
 APART = 5.0
 """Standard deviation of the error of the law where readings within a metre count as one, dB."""
 NEAREST = 0.1
@@ -70,9 +65,9 @@ class PowerMap:
     receivers: Float[Array, "r 3"]
     walls: Walls
     places: Float[Array, "n 3"]
-    law: Float[Array, "r 3"]
-    """Power at one metre (dBm, with the receiver's offset), exponent, loss of the first wall (dB); the last two are common."""
-    law_covariance: Float[Array, "r 3 3"]
+    law: Float[Array, "3"]
+    """Power at one metre (dBm), exponent, loss of the first wall (dB)."""
+    law_covariance: Float[Array, "3 3"]
     scales: Float[Array, "4"]
     """The values of `Scales`, in order."""
     features: Float[Array, "n r"]
@@ -104,7 +99,7 @@ def learn_map(readings: Readings, walls: Walls = NO_WALLS, scales: Scales | None
         raise UserError(f"{len(readings.places)} positions exceed the limit of a map ({MAX_PLACES}); average over larger cells")
     law_features = _law_features(readings.places, readings.receivers, walls)
     law, covariance = _law(readings, law_features)
-    left = np.where(received, readings.powers - np.einsum("nri,ri->nr", law_features, law), 0)
+    left = np.where(received, readings.powers - law_features @ law, 0)
     if scales is None:
         scales = learn_scales(readings, -law_features[..., 2], left)
     root_walls, n = -law_features[..., 2], len(readings.places)
@@ -136,9 +131,9 @@ def received_power(learned: PowerMap, tx_position: Float[Array, "b 3"]) -> tuple
     walls = -features[..., 2]
     k = alike(tx_position, learned.places)[:, None] * (room**2 + wall**2 * walls[..., None] * learned.features.T)
     exact = partial(jnp.einsum, precision=EXACT)  # the variance is a difference of large numbers
-    mean = exact("bri,ri->br", features, learned.law) + exact("brn,rn->br", k, learned.weights)
+    mean = exact("bri,i->br", features, learned.law) + exact("brn,rn->br", k, learned.weights)
     explained = jnp.sum(exact("rmn,brn->brm", learned.inverse_root, k) ** 2, -1)
-    of_law = exact("bri,rij,brj->br", features, learned.law_covariance, features)
+    of_law = exact("bri,ij,brj->br", features, learned.law_covariance, features)
     variance = room**2 + wall**2 * walls**2 - explained + of_law
     return mean, jnp.sqrt(jnp.maximum(variance, 0))
 
@@ -167,35 +162,19 @@ def _law_features(tx: Any, receivers: Any, walls: Walls) -> Any:
     return xp.stack([xp.ones_like(distance), -10 * xp.log10(distance), -root], -1)
 
 
-def _law(
-    readings: Readings, features: Float[np.ndarray, "n r 3"]
-) -> tuple[Float[np.ndarray, "r 3"], Float[np.ndarray, "r 3 3"]]:
-    """Returns the law of every receiver by least squares with a normal prior, and its covariance. Fitted are three parameters
-    common to all receivers and an offset for each; the spread of the offsets is the most probable one."""
+def _law(readings: Readings, features: Float[np.ndarray, "n r 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Returns the law by least squares with a normal prior, and its covariance."""
     side = 1.0  # metres: the readings within a square of this size count as one reading in the fit of the law
     _, square = np.unique(np.floor(readings.places / side).astype(int), axis=0, return_inverse=True)
-    received, n_receivers = np.isfinite(readings.powers), len(readings.receivers)
+    received = np.isfinite(readings.powers)
     weights = np.zeros(readings.powers.shape)
-    for r in range(n_receivers):
+    for r in range(len(readings.receivers)):
         own = square.reshape(-1)[received[:, r]]
         weights[received[:, r], r] = 1 / (APART**2 * np.bincount(own, minlength=square.max() + 1)[own])
     left = np.where(received, readings.powers - features @ LAW, 0)
-    of_fitted = np.zeros((n_receivers, 3, 3 + n_receivers))  # from the fitted parameters to the law of a receiver
-    of_fitted[:, range(3), range(3)] = of_fitted[range(n_receivers), 0, range(3, 3 + n_receivers)] = 1
-    factors = np.einsum("nri,rij->nrj", features, of_fitted).reshape(-1, 3 + n_receivers)
-    weighted = factors.T * weights.reshape(-1)
-    precision, moment = weighted @ factors, weighted @ left.reshape(-1)
-
-    def fitted(offset: float) -> tuple[float, Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
-        widths = np.concatenate([LAW_WIDTH, np.full(n_receivers, offset)])
-        covariance = np.linalg.inv(precision + np.diag(widths**-2))
-        mean = covariance @ moment
-        evidence = (moment @ mean + np.linalg.slogdet(covariance)[1]) / 2 - n_receivers * np.log(offset)
-        return float(evidence - np.log(offset / OFFSET) ** 2 / 2), mean, covariance
-
-    _, mean, covariance = max((fitted(offset) for offset in OFFSETS), key=lambda one: one[0])
-    law = LAW + of_fitted @ mean
-    return law, of_fitted @ covariance @ of_fitted.swapaxes(-1, -2)
+    precision = np.einsum("nri,nr,nrj->ij", features, weights, features) + np.diag(LAW_WIDTH**-2.0)
+    covariance = np.linalg.inv(precision)
+    return LAW + covariance @ np.einsum("nri,nr,nr->i", features, weights, left), covariance
 
 
 def _covariance(
