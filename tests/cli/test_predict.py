@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 from typing import ClassVar
 
 import jax
@@ -317,6 +318,12 @@ def test_what_was_interrupted_goes_on(hearing, tmp_path, monkeypatch):
     assert refused.code == 2 and "--resume" in refused.err
     refused = predict(*hearing, "--line", "0,0,1:2,0,1:6", "--ghz", 2, 5, "--what", "power", "--out", out, "--resume")
     assert refused.code == 2 and "another command (queries changed)" in refused.err
+    config = hearing[1] / "config.json"
+    written = config.stat()
+    os.utime(config, (0, 0))  # as of a training that has replaced this one
+    refused = predict(*ask, "--out", out, "--resume")
+    assert refused.code == 2 and "another command (trained changed)" in refused.err
+    os.utime(config, ns=(written.st_atime_ns, written.st_mtime_ns))
     assert predict(*ask, "--out", out, "--resume").code == 0
     assert len(asked) == 3 and not part.exists()
     with np.load(out) as one, np.load(whole) as other:
@@ -359,7 +366,17 @@ def test_a_field_that_was_left_ready_says_the_same(tmp_path, monkeypatch, what, 
     assert predict(*ask[:-1], "--rx", 1, "--out", tmp_path / "none.npz").code == 2
     for entry in (tmp_path / "cache").rglob("ready/*.npz"):
         entry.write_bytes(b"damaged")
-    assert predict(*ask, tmp_path / "third.npz").code == 0 and loaded
+
+    def read_before_a_change(folder, *more):
+        found = real(folder, *more)
+        loaded.append(folder)
+        os.utime(run / "config.json", (len(loaded), 0))
+        return found
+
+    monkeypatch.setattr(predict_command, "load_field", read_before_a_change)
+    for _ in range(2):  # what was read before a file changed is not used afterwards
+        loaded.clear()
+        assert predict(*ask, tmp_path / "third.npz").code == 0 and loaded
     write_config(run, RunConfig("gone.npz", "wideband", "smoke", 0, None, SETTINGS))
     assert predict(*ask, tmp_path / "fourth.npz").code == 2
 

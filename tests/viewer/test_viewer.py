@@ -21,6 +21,7 @@ from wbgs_jax.training.run_folder import load_trained
 from wbgs_jax.types import make_receiver
 from wbgs_jax.viewer import drawing, figures, panel, session, walk
 from wbgs_jax.viewer.app import Latest
+from wbgs_jax.viewer.page import Page
 from wbgs_jax.viewer.session import LinkBudget, Session
 from wbgs_jax.viewer.surroundings import FIELD_OF_VIEW, camera_of
 
@@ -211,6 +212,24 @@ def test_a_receiver_is_moved_where_the_field_allows_it(coherent, splatting):
     assert coherent.predict(PLACE, HZ).power_db == before
     with pytest.raises(UserError, match="only the receivers that it was trained with"):
         splatting.use_receiver(make_receiver([0.0, 0.0, 0.5]))
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.7, 2.5), (-0.003, 2.4), (1.5, 1.5)])
+def test_the_panel_opens_for_a_room_of_any_height(low, high, coherent):
+    """Heights in single precision, which may be just below those with two decimals."""
+    page = Page(port=0)
+    try:
+        controls, _ = panel.make_panel(page.server, coherent, PLACE, (float(np.float32(low)), high), high)
+        assert controls.cut.min <= controls.cut.value[0] and controls.cut.value[1] <= controls.cut.max
+    finally:
+        page.stop()
+
+
+def test_the_truth_is_that_of_the_same_array(splatting, monkeypatch):
+    assert len(splatting._links_with_spectra())
+    turned = dataclasses.replace(splatting.receiver, orientation=jnp.array([0.8, 0, 0, 0.6]))
+    monkeypatch.setattr(splatting, "receiver", turned)
+    assert not len(splatting._links_with_spectra())
 
 
 def grey(drawn):

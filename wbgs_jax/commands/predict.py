@@ -183,21 +183,22 @@ def _export(command: Command) -> None:
 
 def open_field(command: Command, queries: Queries) -> "CachedField | LoadedField":
     """Returns the field for the queries, from the cache if an earlier command stored it there."""
-    from wbgs_jax.inference.cached_field import MOST, load_cached, make_cached
+    from wbgs_jax.inference.cached_field import MOST, load_cached, make_cached, state_of
 
     lowest, few = lowest_queried(command, queries), len(queries) <= MOST
     if cached := load_cached(command.folder, command.rx, command.what, len(queries), lowest):
         return cached
     from wbgs_jax.inference.evaluate_quantities import check_quantity
-    from wbgs_jax.training.run_folder import sources_of
+    from wbgs_jax.training.run_folder import read_config, sources_of
 
+    watched = sources_of(command.folder, read_config(command.folder))
+    state = state_of(watched)
     tx, rx = (parse_vector(word, f"--{name}-velocity") for name, word in _velocities(command).items())
     options = Options(tx, rx, 1e6 * command.band_mhz, command.points, parsing.parse_array(command.tx_array))
     loaded = load_field(command.folder, command.rx, lowest, options)
     check_quantity(command.what, loaded.trained.field, loaded.dataset)
     if few and command.what in COMPILED:
-        watched = sources_of(command.folder, loaded.trained.config)
-        return make_cached(command.folder, command.rx, len(queries), loaded, watched) or loaded
+        return make_cached(command.folder, command.rx, len(queries), loaded, watched, state) or loaded
     return loaded
 
 
@@ -228,7 +229,12 @@ def _question(command: Command, queries: Queries, source: dict[str, Any]) -> dic
     options = {
         name: getattr(command, name) for name in ("what", "rx", "tx_velocity", "rx_velocity", "band_mhz", "points", "tx_array")
     }
-    return options | {"run": str(command.folder.resolve()), "queries": queries.digest(), "block": BLOCK, "source": source}
+    from wbgs_jax.inference.cached_field import state_of
+    from wbgs_jax.training.run_folder import read_config, sources_of
+
+    run = command.folder.resolve()
+    trained = state_of(sources_of(run, read_config(run)))
+    return options | {"run": str(run), "trained": trained, "queries": queries.digest(), "block": BLOCK, "source": source}
 
 
 def answer(command: Command, queries: Queries) -> None:

@@ -118,9 +118,13 @@ def main(arguments: list[str] | None = None) -> None:
         say(f"drawing the predictions of {command.folder} ...")
     viewer = start(command)
     if command.html:
-        viewer.wait()
-        say(f"page: {viewer.save()}")
-        viewer.stop()
+        try:
+            viewer.wait()
+            if not viewer.updates:
+                raise UserError(f"the prediction failed, and {command.html} was not written; the line above has the reason")
+            say(f"page: {viewer.save()}")
+        finally:
+            viewer.stop()
         return
     if command.host not in LOCAL:
         say(

@@ -86,7 +86,7 @@ def load_cached(run: Path, rx: str, what: str, count: int, lowest_hz: float) -> 
     try:
         with opened_archive(path, "", "") as archive:
             meta = json.loads(str(archive["meta"]))
-            if what not in meta["what"] or lowest_hz < meta["lowest_hz"] or meta["state"] != _state(meta["watched"]):
+            if what not in meta["what"] or lowest_hz < meta["lowest_hz"] or meta["state"] != state_of(meta["watched"]):
                 return None
             arrays = tuple(archive[str(i)] for i in range(meta["arrays"]))
         return CachedField(meta, arrays, load_program(path.parents[1], meta["program"]))
@@ -94,7 +94,9 @@ def load_cached(run: Path, rx: str, what: str, count: int, lowest_hz: float) -> 
         return None  # damaged in some way: it is created again
 
 
-def make_cached(run: Path, rx: str, count: int, loaded: "LoadedField", watched: Sequence[Path]) -> CachedField | None:
+def make_cached(
+    run: Path, rx: str, count: int, loaded: "LoadedField", watched: Sequence[Path], state: str
+) -> CachedField | None:
     """Stores a trained field at one receiver for `load_cached`, and returns it; None if it cannot be stored.
 
     Args:
@@ -103,6 +105,7 @@ def make_cached(run: Path, rx: str, count: int, loaded: "LoadedField", watched: 
         count: number of queries.
         loaded: the field at that receiver.
         watched: files and folders from which it is derived; a change invalidates the stored field.
+        state: result of `state_of` for them, from before they were read: a training may write to them meanwhile.
     """
     from wbgs_jax.inference.evaluate_quantities import lowest_frequency
     from wbgs_jax.inference.export import answer_all, freeze, frozen_outputs
@@ -129,7 +132,7 @@ def make_cached(run: Path, rx: str, count: int, loaded: "LoadedField", watched: 
         "what": [what for what in COMPILED if QUANTITIES[what].outputs[0] in names],
         "lowest_hz": lowest_frequency(trained.field, loaded.dataset),
         "watched": [str(place) for place in watched],
-        "state": _state(watched),
+        "state": state,
         "arrays": len(arrays),
     }
     try:
@@ -148,7 +151,7 @@ def _place(run: Path, rx: str, count: int) -> Path | None:
     return None if folder is None else folder / "ready" / f"{hashlib.sha256(words).hexdigest()[:32]}.npz"
 
 
-def _state(watched: Sequence[Path | str]) -> str:
+def state_of(watched: Sequence[Path | str]) -> str:
     """Returns a checksum that changes with this package, JAX and the files (their sizes and modification times)."""
     words = [source_digest(), jax.__version__, jax.default_backend(), os.environ.get("XLA_FLAGS", "")]
     for root in map(Path, watched):

@@ -143,7 +143,7 @@ def at_receiver(trained: TrainedField, receiver: Receiver, dataset: Dataset | No
         UserError: no part of the field is receiver-independent.
     """
     dataset = trained.dataset() if dataset is None else dataset
-    if any(_same(dataset.receiver(number), receiver) for number in range(dataset.n_receivers)):
+    if receiver_number(dataset, receiver) is not None:
         return trained
     field, params = trained.field.receiver_independent(trained.params)
     return dataclasses.replace(trained, field=field, params=params, correction=None, intervals=None, power_intervals=None)
@@ -156,6 +156,12 @@ def at_receivers(trained: TrainedField, dataset: Dataset) -> TrainedField:
         if (elsewhere := at_receiver(trained, dataset.receiver(number), own)) is not trained:
             return elsewhere
     return trained
+
+
+def receiver_number(dataset: Dataset, receiver: Receiver) -> int | None:
+    """Returns the index of a receiver in the data: the same array at the same place in the same orientation; None if there is
+    no such receiver."""
+    return next((number for number in range(dataset.n_receivers) if _same(dataset.receiver(number), receiver)), None)
 
 
 def _same(a: Receiver, b: Receiver) -> bool:

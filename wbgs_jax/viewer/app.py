@@ -63,8 +63,10 @@ class Latest:
             try:
                 self._work()
             except Exception as error:  # the viewer continues, and shows why nothing changed
-                self._on_error(f"{type(error).__name__}: {error}")
-            self._busy = False
+                with contextlib.suppress(Exception):  # standard error may be closed
+                    self._on_error(f"{type(error).__name__}: {error}")
+            finally:
+                self._busy = False
 
 
 class _OutdatedError(Exception):

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.inference.evaluate_quantities import lowest_frequency
+from wbgs_jax.inference.trained_field import receiver_number
 from wbgs_jax.types import MAX_FREQUENCY_HZ
 from wbgs_jax.viewer import drawing, figures
 from wbgs_jax.viewer.page import as_words
@@ -101,7 +102,9 @@ def make_panel(
     summary = gui.add_html(as_words("The first prediction compiles the field, which takes a while ..."))
     spectrum = gui.add_html("")
     names = receiver_names(session)
-    receiver = gui.add_dropdown("receiver", names, initial_value=names[0], disabled=len(names) < 2)
+    number = receiver_number(session.dataset, session.receiver)
+    shown = names[-1 if number is None else number]
+    receiver = gui.add_dropdown("receiver", names, initial_value=shown, disabled=len(names) < 2)
     position = gui.add_vector3("transmitter", (start[0], start[1], start[2]), step=0.01, hint="x, y, z in metres")
     low, high = lowest_frequency(session.trained.field, session.dataset) / 1e9, MAX_FREQUENCY_HZ / 1e9
     first = float(known[len(known) // 2])
@@ -132,7 +135,8 @@ def make_panel(
     with tabs.add_tab("Map"):
         map_controls = _map_controls(gui, session)
     with tabs.add_tab("Room"):
-        cut = gui.add_multi_slider("heights [m]", round(heights[0], 2), round(top, 2), step=0.01, initial_value=heights)
+        lowest, highest = np.floor(100 * heights[0]) / 100, np.ceil(100 * top) / 100  # heights must lie between them
+        cut = gui.add_multi_slider("heights [m]", lowest, max(highest, lowest + 0.01), step=0.01, initial_value=heights)
         gaussians = gui.add_dropdown("Gaussians", ("off", "signal", "attenuation")) if session.has_gaussians else None
         gaussian_scale = gui.add_html("")
         play = gui.add_checkbox("walk", False, hint="Move the transmitter through the room.")

@@ -17,11 +17,11 @@ from wbgs_jax.fields.base import Ability, GaussianState, MaterialProperties, Par
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.inference.evaluate_quantities import LoadedField
 from wbgs_jax.inference.intervals import expected_power, expected_ssim
-from wbgs_jax.inference.kriging import SAME_PLACE_M, correct, for_receiver
+from wbgs_jax.inference.kriging import correct, for_receiver
 from wbgs_jax.inference.path_table import describe_interactions
 from wbgs_jax.inference.predictor import as_observed, check_power
 from wbgs_jax.inference.radio_map import Plane, evaluate_plane, pieces
-from wbgs_jax.inference.trained_field import at_receiver
+from wbgs_jax.inference.trained_field import at_receiver, receiver_number
 from wbgs_jax.metrics import ssim
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.radio.channel import NO_PATH_DB, Paths, decibels, delay_spread_s, k_factor_db
@@ -275,9 +275,7 @@ class Session:
         """Returns the indices of the links of this receiver with observed spectra."""
         if not self.dataset.has_spectra:
             return np.zeros(0, int)
-        places = np.asarray(self.dataset.receivers.position)
-        away = np.linalg.norm(places - np.asarray(self.receiver.position), axis=1)
-        return np.flatnonzero((self.dataset.receiver_index == np.argmin(away)) & (away.min() < SAME_PLACE_M))
+        return np.flatnonzero(self.dataset.receiver_index == receiver_number(self.dataset, self.receiver))
 
     def _sample(self, link: int) -> Sample:
         data, index = self.dataset, np.array([link])
