@@ -20,6 +20,14 @@ def test_places_are_chosen_where_readings_lack(tmp_path, rng):
     assert done.out.splitlines()[0].lstrip().startswith("1. (")
 
 
+def test_the_map_is_that_of_the_same_options(tmp_path, rng):
+    """Readings without heights, at two metres: candidates at one metre lie below them."""
+    data, grid = folder(tmp_path, rng, n=25), "1,1,1:7,2,1:3x2x1"
+    high, low = (call(main, "--data", data, "--grid", grid, "--count", 2, "--height", height) for height in (2, 1.2))
+    assert high.code == low.code == 0 and "candidates are up to 1 m above or below" in high.err
+    assert "above or below" not in low.err and high.out != low.out
+
+
 @pytest.mark.heavy
 def test_a_trained_field_expects_errors_where_it_was_not_trained(tmp_path):
     options = ("--grid=-2,-2,1.5:2,2,1.5:5x5x1", "--count", 3, "--ghz", 28)
@@ -45,6 +53,8 @@ def test_a_trained_field_expects_errors_where_it_was_not_trained(tmp_path):
         (["--data", "DATA", "--grid", "0,0,1:1,1,1:2x2x1", "--ghz", 3], "--ghz and --rx are those of a trained field"),
         (["--data", "DATA", "--candidates", "nowhere.csv"], "cannot read nowhere.csv"),
         (["--run", "nowhere", "--grid", "0,0,1:1,1,1:2x2x1"], "nowhere"),
+        (["--example", "--grid", "0,0,1:1,1,1:2x2x1", "--height", 1], "are those of readings"),
+        (["--data", "DATA", "--grid", "0,0,1:1,1,1:2x2x1", "--cell", 0], "--cell is 0"),
     ],
 )
 def test_errors_are_for_people(tmp_path, rng, options, says):

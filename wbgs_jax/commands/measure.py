@@ -29,7 +29,7 @@ from wbgs_jax._util.cli import parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, check_writable, write_csv, write_json
-from wbgs_jax.commands.options import PICTURES, check_suffixes
+from wbgs_jax.commands.options import PICTURES, SurveyOptions, check_suffixes
 from wbgs_jax.data.floor_plan import extruded
 from wbgs_jax.data.rssi_folder import attribution
 from wbgs_jax.data.tables import check_positions
@@ -37,22 +37,16 @@ from wbgs_jax.evaluation.report import environment
 from wbgs_jax.inference.domain import Domain
 from wbgs_jax.plotting import draw_power_maps, save
 from wbgs_jax.power_map.model import PowerMap, learn_map, received_power
-from wbgs_jax.power_map.survey import CELL_M, HEIGHT_M, find_walls, load_survey
+from wbgs_jax.power_map.survey import find_walls, load_survey
 from wbgs_jax.power_map.validation import COMPARED, NINETY, Score, scores
 
 
 @dataclass(frozen=True)
-class Command:
+class Command(SurveyOptions):
     """Fit a map of received power to readings at many positions, and validate it on held-out rooms and squares."""
 
     data: Path | None = None
     """Folder with readings.csv, receivers.csv and, optionally, the floor plan walls.csv (docs/measured.md)."""
-    floor_plan: Path | None = None
-    """Walls: a CSV file of segments x1,y1,x2,y2, or of the corners x,y of an outline; by default that of the folder."""
-    height: float = HEIGHT_M
-    """Height of the transmitters above the floor (metres), if the readings have no z."""
-    cell: float = CELL_M
-    """Side of the cells (metres) over which readings are averaged."""
     out: Path | None = None
     """Write the scores to this .json file."""
     picture: Path | None = None
@@ -76,10 +70,9 @@ def check(command: Command) -> None:
         raise UserError("predicted powers need readings: give --data FOLDER")
     if command.answers and not command.tx:
         raise UserError("--answers needs --tx x,y,z")
-    for name in ("height", "cell", "ceiling"):
-        value = getattr(command, name)
-        if not (np.isfinite(value) and (name == "height" or value > 0)):
-            raise UserError(f"--{name} is {value:g}; give metres")
+    command.survey_settings()
+    if not 0 < command.ceiling < np.inf:
+        raise UserError(f"--ceiling is {command.ceiling:g}; give metres")
 
 
 def table(found: list[Score]) -> Table:
@@ -156,7 +149,7 @@ def main(arguments: list[str] | None = None) -> None:
         say(f"mesh: {command.mesh} ({len(walls.ends)} walls, {command.ceiling:g} m high)")
     if command.data is None:
         return
-    survey = load_survey(command.data, command.height, command.cell, command.floor_plan)
+    survey = load_survey(command.data, **command.survey_settings())
     cells, size = survey.cells, survey.cell_m
     say(f"{len(cells.places)} cells of {size:g} m, {len(cells.receivers)} receivers, {len(walls.ends)} walls or faces of walls")
     for line in attribution(command.data):

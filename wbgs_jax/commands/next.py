@@ -21,13 +21,13 @@ from wbgs_jax._util.cli import parse_vector, point_words, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import check_writable, write_csv
-from wbgs_jax.commands.options import TrainedFieldOptions, check_suffixes, load_field, parse_frequencies
+from wbgs_jax.commands.options import SurveyOptions, TrainedFieldOptions, check_suffixes, load_field, parse_frequencies
 from wbgs_jax.inference import queries as parsing
 from wbgs_jax.inference.results_file import EXACT
 
 
 @dataclass(frozen=True)
-class Command(TrainedFieldOptions):
+class Command(TrainedFieldOptions, SurveyOptions):
     """Choose where to measure next: the places about which a field is most uncertain, in an order to walk them."""
 
     data: Path | None = None
@@ -82,6 +82,8 @@ def check(command: Command) -> None:
         raise UserError(f"--length {command.length:g} is not a distance; give metres")
     if command.data and (command.ghz or command.rx):
         raise UserError("--ghz and --rx are those of a trained field; readings have neither")
+    if command.survey_settings() and not command.data:
+        raise UserError("--floor-plan, --height and --cell are those of readings: give --data FOLDER")
 
 
 def candidates_of(command: Command) -> Float[np.ndarray, "c 3"]:
@@ -138,7 +140,13 @@ def of_readings(command: Command, places: Float[np.ndarray, "c 3"]) -> State:
     from wbgs_jax.power_map.survey import load_survey
 
     assert command.data is not None, "checked"
-    survey = load_survey(command.data)
+    survey = load_survey(command.data, **command.survey_settings())
+    apart = np.abs(places[:, 2, None] - np.unique(survey.measured[:, 2])).min(1)
+    most_apart_m = 0.5  # a map of one height is not one of another
+    if apart.max() > most_apart_m:
+        say(
+            f"note: candidates are up to {apart.max():.2g} m above or below all readings; --height or z of the readings sets theirs"
+        )
     learned = learn_map(survey.cells, survey.walls)
     _, std = jax.jit(received_power)(learned, jnp.asarray(places, jnp.float32))
     outside = survey.domain.outside(places)

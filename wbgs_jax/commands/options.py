@@ -52,6 +52,27 @@ class TrainedFieldOptions:
         return self.run or EXAMPLE
 
 
+@dataclass(frozen=True, kw_only=True)
+class SurveyOptions:
+    """How readings of received power become a map."""
+
+    floor_plan: Path | None = None
+    """Walls: a CSV file of segments x1,y1,x2,y2, or of the corners x,y of an outline; by default that of the folder."""
+    height: float | None = None
+    """Height of the transmitters above the floor, if the readings have no z; by default 1.3 m."""
+    cell: float | None = None
+    """Side of the cells over which readings are averaged; by default 0.25 m."""
+
+    def survey_settings(self) -> dict[str, Any]:
+        """Returns the arguments of `load_survey` that were given; a height or size that is none is a `UserError`."""
+        given = {"height": self.height, "cell": self.cell}
+        for name, value in given.items():
+            if value is not None and not (np.isfinite(value) and (name == "height" or value > 0)):
+                raise UserError(f"--{name} is {value:g}; give metres")
+        named = {"floor_plan": self.floor_plan, "height_m": self.height, "cell_m": self.cell}
+        return {name: value for name, value in named.items() if value is not None}
+
+
 def check_suffixes(command: Any, suffixes: Mapping[str, Sequence[str]]) -> None:
     """Raises a `UserError` if the name of an output file has none of the suffixes that its option allows."""
     for name, allowed in suffixes.items():
