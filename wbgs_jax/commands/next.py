@@ -144,9 +144,7 @@ def of_readings(command: Command, places: Float[np.ndarray, "c 3"]) -> State:
     apart = np.abs(places[:, 2, None] - np.unique(survey.measured[:, 2])).min(1)
     most_apart_m = 0.5  # a map of one height is not one of another
     if apart.max() > most_apart_m:
-        say(
-            f"note: candidates are up to {apart.max():.2g} m above or below all readings; --height or z of the readings sets theirs"
-        )
+        say(f"note: candidates are up to {apart.max():.2g} m above or below all readings, whose height is z or --height")
     learned = learn_map(survey.cells, survey.walls)
     _, std = jax.jit(received_power)(learned, jnp.asarray(places, jnp.float32))
     outside = survey.domain.outside(places)

@@ -54,7 +54,7 @@ class TrainedFieldOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class SurveyOptions:
-    """How readings of received power become a map."""
+    """Height and cells of readings, and their floor plan."""
 
     floor_plan: Path | None = None
     """Walls: a CSV file of segments x1,y1,x2,y2, or of the corners x,y of an outline; by default that of the folder."""
@@ -64,7 +64,7 @@ class SurveyOptions:
     """Side of the cells over which readings are averaged; by default 0.25 m."""
 
     def survey_settings(self) -> dict[str, Any]:
-        """Returns the arguments of `load_survey` that were given; a height or size that is none is a `UserError`."""
+        """Returns the arguments of `load_survey` that were given; what cannot be a length is a `UserError`."""
         given = {"height": self.height, "cell": self.cell}
         for name, value in given.items():
             if value is not None and not (np.isfinite(value) and (name == "height" or value > 0)):
