@@ -229,12 +229,9 @@ def learn_share(known: Scored, usual_spread: float = USUAL_SPREAD) -> Share:
     number_of_folds = 5  # folds of the cross-validation over transmitters
     folds = np.unique(known.tx_index, return_inverse=True)[1] % number_of_folds
     if len(np.unique(known.tx_index)) < 2 * number_of_folds:
-        gains = known.scores.T - known.scores[:, -1]
-        bounds = [
-            lower_bound(gain, known.tx_index, (1 - share) * usual_spread, 1.0)
-            for gain, share in zip(gains[:-1], SHARES[:-1], strict=True)
-        ]
-        return constant(float(SHARES[np.argmax(bounds)]) if max(bounds) > 0 else 1.0)
+        best = np.argmax(known.scores.mean(0))
+        gains, change = known.scores[:, best] - known.scores[:, -1], 1 - SHARES[best]
+        return common if lower_bound(gains, known.tx_index, change * usual_spread, 1.0) > 0 else constant(1.0)
     gains = np.zeros(len(folds))
     for fold in range(number_of_folds):
         own, rest = (jax.tree.map(lambda a, keep=keep: a[keep], known) for keep in (folds == fold, folds != fold))

@@ -114,8 +114,9 @@ def _wedge(first: _Side, second: _Side, facets: Facets, solid: bool) -> list[tup
     normal_0, normal_n = np.asarray(facets.normal)[[i, j]]
     centre_0, centre_n = np.asarray(facets.corners)[[i, j]].mean(1)
     height_0, height_n = (centre_n - centre_0) @ normal_0, (centre_0 - centre_n) @ normal_n
-    if solid:
-        bends = max(height_0, height_n) < 0 and np.arccos(np.clip(normal_0 @ normal_n, -1, 1)) > SHARPEST
+    turn = np.arccos(np.clip(normal_0 @ normal_n, -1, 1))
+    if solid or turn > np.pi - SHARPEST:  # or the two sides of a screen
+        bends = max(height_0, height_n) < 0 and turn > SHARPEST
     else:
         bends = np.linalg.norm(np.cross(normal_0, normal_n)) > np.sin(SHARPEST)
         normal_0, normal_n = -np.sign(height_0) * normal_0, -np.sign(height_n) * normal_n

@@ -75,7 +75,7 @@ class ExpertWeights(Hook):
             spectra = learn_shares(
                 features, tx_index, observed_predictions(predicted, floor), partial(similarity, pas, stride=COARSE)
             )
-        usual_spread_db = 3.0  # of the difference in error of two experts, over transmitters
+        usual_spread_db = 1.0  # of the difference in error of two experts, over transmitters
         known = measured_db is not None and np.any(measured_db > NO_PATH_DB)
         power = (
             coherent_alone()
