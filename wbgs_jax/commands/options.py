@@ -57,11 +57,11 @@ class SurveyOptions:
     """Height and cells of readings, and their floor plan."""
 
     floor_plan: Path | None = None
-    """Walls: a CSV file of segments x1,y1,x2,y2, or of the corners x,y of an outline; by default that of the folder."""
+    """Walls as segments x1,y1,x2,y2 or corners x,y (.csv); by default those of the folder."""
     height: float | None = None
-    """Height of the transmitters above the floor, if the readings have no z; by default 1.3 m."""
+    """Height of the transmitters (metres) if the readings have no z; by default 1.3."""
     cell: float | None = None
-    """Side of the cells over which readings are averaged; by default 0.25 m."""
+    """Side (metres) of the cells that readings are averaged over; by default 0.25."""
 
     def survey_settings(self) -> dict[str, Any]:
         """Returns the arguments of `load_survey` that were given; what cannot be a length is a `UserError`."""
