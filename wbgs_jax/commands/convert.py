@@ -25,7 +25,7 @@ from wbgs_jax._util.cli import parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import check_writable
-from wbgs_jax.commands.options import load_field, parse_frequencies, warn
+from wbgs_jax.commands.options import check_effects, load_field, parse_frequencies, warn
 from wbgs_jax.inference.queries import parse_array, parse_grid
 
 # Modules that load JAX are imported where they are used, as in predict.py.
@@ -86,14 +86,6 @@ class Command:
     """... and of the set of users."""
 
 
-def check_options(command: Command, *kinds: str) -> None:
-    """Raises a `UserError` for an option that belongs to other inputs than (one of) these."""
-    for name, own in KINDS.items():
-        if getattr(command, name) != getattr(Command, name) and not set(own) & set(kinds):
-            option, given = f"--{name.replace('_', '-')}", " or ".join(kinds)
-            raise UserError(f"{option} has no effect on {given}; it belongs to {' or '.join(own)}")
-
-
 def check(command: Command) -> None:
     """Raises a `UserError` for an invalid command line."""
     if [command.run, command.paths, command.model].count(None) != 2:
@@ -101,7 +93,8 @@ def check(command: Command) -> None:
             "give one of --run RUN, to convert a trained field, --paths FILE, to create a scene file from paths, or a model "
             "such as room.glb, to create a room file"
         )
-    check_options(command, *((RUN,) if command.run else (MODEL,) if command.model else (SIONNA, DEEPMIMO)))
+    kinds = (RUN,) if command.run else (MODEL,) if command.model else (SIONNA, DEEPMIMO)
+    check_effects(command, KINDS, kinds, " or ".join(kinds))
     if command.run is None and command.out.suffix != ".npz":
         raise UserError(f"--out {command.out} does not end in .npz, as scene files and room files must")
     if command.run is None:
@@ -182,7 +175,8 @@ def take_in(command: Command) -> str:
             f"{command.paths} is of an unknown kind; give an .npz file with Sionna's arrays, or a DeepMIMO scenario"
         )
     of_deepmimo = is_deepmimo(command.paths)
-    check_options(command, DEEPMIMO if of_deepmimo else SIONNA)
+    kind = DEEPMIMO if of_deepmimo else SIONNA
+    check_effects(command, KINDS, (kind,), kind)
     room = None if command.mesh is None else open_room(command.mesh)
     shape, name = parse_array(command.array, "--array") if command.array else None, command.out.stem
     if of_deepmimo:

@@ -26,6 +26,7 @@ from wbgs_jax._util.progress_lines import CountProgress
 from wbgs_jax.commands.options import (
     PICTURES,
     TrainedFieldOptions,
+    check_effects,
     check_suffixes,
     load_field,
     parse_frequencies,
@@ -105,9 +106,8 @@ def _check_network(command: Command) -> None:
         raise UserError(
             f"--what {command.what} {'needs' if not command.tx else 'takes no'} --tx x,y,z; it belongs to {several}"
         )
-    for name in ("power_dbm", "load", "bandwidth_mhz", "noise_figure"):
-        if not command.tx and getattr(command, name) != getattr(Command, name):
-            raise UserError(f"--{name.replace('_', '-')} has no effect on --what {command.what}; it belongs to {several}")
+    owners = dict.fromkeys(("power_dbm", "load", "bandwidth_mhz", "noise_figure"), NETWORK)
+    check_effects(command, owners, (command.what,), f"--what {command.what}")
     if command.tx and command.rx:
         raise UserError("--tx maps over all receivers of the plane; omit --rx")
     for option, values in {"power-dbm": command.power_dbm, "load": command.load}.items():

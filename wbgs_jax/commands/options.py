@@ -73,6 +73,20 @@ class SurveyOptions:
         return {name: value for name, value in named.items() if value is not None}
 
 
+def check_effects(command: Any, owners: Mapping[str, Sequence[str]], given: Sequence[str], words: str) -> None:
+    """Raises a `UserError` for an option that was given without effect.
+
+    Args:
+        command: the command line.
+        owners: what options belong to, such as quantities or kinds of input; any one suffices.
+        given: which of these the command line has.
+        words: the same for the message.
+    """
+    for name, own in owners.items():
+        if getattr(command, name) != getattr(type(command), name) and not set(own) & set(given):
+            raise UserError(f"--{name.replace('_', '-')} has no effect on {words}; it belongs to {' or '.join(own)}")
+
+
 def check_suffixes(command: Any, suffixes: Mapping[str, Sequence[str]]) -> None:
     """Raises a `UserError` if the name of an output file has none of the suffixes that its option allows."""
     for name, allowed in suffixes.items():

@@ -29,6 +29,7 @@ from wbgs_jax._util.progress_lines import CountProgress
 from wbgs_jax.commands.options import (
     PICTURES,
     TrainedFieldOptions,
+    check_effects,
     check_suffixes,
     load_field,
     parse_frequencies,
@@ -51,14 +52,12 @@ if TYPE_CHECKING:
 else:
     What = Literal[names_for("predict")]
 
-BELONG = {
-    "tx_velocity": "paths",
-    "rx_velocity": "paths",
-    "band_mhz": "frequency-response",
-    "points": "frequency-response",
-    "tx_array": "mimo",
+OWNERS = {
+    **dict.fromkeys(("tx_velocity", "rx_velocity"), ("paths",)),
+    **dict.fromkeys(("band_mhz", "points"), ("frequency-response",)),
+    "tx_array": ("mimo",),
 }
-"""Options that affect a single quantity."""
+"""Quantities that options affect; the others affect all."""
 BLOCK = 256
 """Number of queries predicted and stored at a time."""
 
@@ -123,9 +122,7 @@ def check(command: Command) -> None:
     for several in (places, bands):
         if len(several) > 1:
             raise UserError(f"--{several[0]} and --{several[1]} exclude each other; give one of them")
-    for name, what in BELONG.items():
-        if command.what != what and getattr(command, name) != getattr(Command, name):
-            raise UserError(f"--{name.replace('_', '-')} has no effect on --what {command.what}; it belongs to {what}")
+    check_effects(command, OWNERS, (command.what,), f"--what {command.what}")
     for name, word in _velocities(command).items():
         parse_vector(word, f"--{name}-velocity")
     parsing.parse_array(command.tx_array)
@@ -183,16 +180,14 @@ def _export(command: Command) -> None:
 
 def open_field(command: Command, queries: Queries) -> "CachedField | LoadedField":
     """Returns the field for the queries, from the cache if an earlier command stored it there."""
-    from wbgs_jax.inference.cached_field import MOST, load_cached, make_cached, state_of
+    from wbgs_jax.inference.cached_field import MOST, load_cached, make_cached
 
     lowest, few = lowest_queried(command, queries), len(queries) <= MOST
     if cached := load_cached(command.folder, command.rx, command.what, len(queries), lowest):
         return cached
     from wbgs_jax.inference.evaluate_quantities import check_quantity
-    from wbgs_jax.training.run_folder import read_config, sources_of
 
-    watched = sources_of(command.folder, read_config(command.folder))
-    state = state_of(watched)
+    watched, state = _files(command.folder)
     tx, rx = (parse_vector(word, f"--{name}-velocity") for name, word in _velocities(command).items())
     options = Options(tx, rx, 1e6 * command.band_mhz, command.points, parsing.parse_array(command.tx_array))
     loaded = load_field(command.folder, command.rx, lowest, options)
@@ -200,6 +195,15 @@ def open_field(command: Command, queries: Queries) -> "CachedField | LoadedField
     if few and command.what in COMPILED:
         return make_cached(command.folder, command.rx, len(queries), loaded, watched, state) or loaded
     return loaded
+
+
+def _files(run: Path) -> tuple[list[Path], str]:
+    """Returns the files that a run is read from, and a checksum of their state."""
+    from wbgs_jax.inference.cached_field import state_of
+    from wbgs_jax.training.run_folder import read_config, sources_of
+
+    files = sources_of(run, read_config(run))
+    return files, state_of(files)
 
 
 def answer_blocks(command: Command, queries: Queries, field: "CachedField | LoadedField") -> Answers:
@@ -229,11 +233,8 @@ def _question(command: Command, queries: Queries, source: dict[str, Any]) -> dic
     options = {
         name: getattr(command, name) for name in ("what", "rx", "tx_velocity", "rx_velocity", "band_mhz", "points", "tx_array")
     }
-    from wbgs_jax.inference.cached_field import state_of
-    from wbgs_jax.training.run_folder import read_config, sources_of
-
     run = command.folder.resolve()
-    trained = state_of(sources_of(run, read_config(run)))
+    _, trained = _files(run)
     return options | {"run": str(run), "trained": trained, "queries": queries.digest(), "block": BLOCK, "source": source}
 
 

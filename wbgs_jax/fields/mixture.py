@@ -225,24 +225,24 @@ def learn_share(known: Scored, usual_spread: float = USUAL_SPREAD) -> Share:
     """Returns the weight that fits links best (host): the same for all, unless the features improve on it by more than a
     standard error in cross-validation. With few transmitters the first expert is used alone, unless another weight is better by
     more than a standard error."""
-    common = constant(_best(known.scores))
+    best = _best(known.scores)
+    common = constant(SHARES[best])
     number_of_folds = 5  # folds of the cross-validation over transmitters
     folds = np.unique(known.tx_index, return_inverse=True)[1] % number_of_folds
     if len(np.unique(known.tx_index)) < 2 * number_of_folds:
-        best = np.argmax(known.scores.mean(0))
         gains, change = known.scores[:, best] - known.scores[:, -1], 1 - SHARES[best]
         return common if lower_bound(gains, known.tx_index, change * usual_spread, 1.0) > 0 else constant(1.0)
     gains = np.zeros(len(folds))
     for fold in range(number_of_folds):
         own, rest = (jax.tree.map(lambda a, keep=keep: a[keep], known) for keep in (folds == fold, folds != fold))
-        by_features, by_all = _fit(rest), constant(_best(rest.scores))
+        by_features, by_all = _fit(rest), constant(SHARES[_best(rest.scores)])
         gains[folds == fold] = _worth(by_features, own) - _worth(by_all, own)
     gain, error = standard_error(gains, known.tx_index)
     return _fit(known) if gain > error else common
 
 
-def _best(scores: Float[np.ndarray, "n shares"]) -> float:
-    return float(SHARES[np.argmax(scores.mean(0))])
+def _best(scores: Float[np.ndarray, "n shares"]) -> int:
+    return int(np.argmax(scores.mean(0)))
 
 
 def _worth(share: Share, known: Scored) -> Float[np.ndarray, " n"]:
@@ -264,7 +264,7 @@ def score_at(scores: Float[Array, "n shares"], share: Float[Array, " n"]) -> Flo
 
 def _fit(known: Scored) -> Share:
     """Returns the coefficients with the largest mean score, for standardised features and with a ridge penalty."""
-    start = constant(min(max(_best(known.scores), 0.05), 0.95))
+    start = constant(min(max(SHARES[_best(known.scores)], 0.05), 0.95))
     mean, scale = known.features.mean(0), known.features.std(0)
     used = scale > 1e-6
     start = Share(start.bias, start.weights, jnp.asarray(mean), jnp.asarray(np.where(used, scale, 1)))

@@ -69,19 +69,15 @@ class ExpertWeights(Hook):
         seen = [jax.tree.map(np.asarray, one) for one in found]
         predicted, powers, features, pas, measured_db = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
         tx_index = np.concatenate([np.asarray(batch.links.tx_index) for batch in batches])
-        floor, spectra = 0.0, coherent_alone()
+        floor, spectra, power = 0.0, coherent_alone(), coherent_alone()
         if pas is not None:
             floor = floor_of(predicted, pas, tx_index)
             spectra = learn_shares(
                 features, tx_index, observed_predictions(predicted, floor), partial(similarity, pas, stride=COARSE)
             )
-        usual_spread_db = 1.0  # of the difference in error of two experts, over transmitters
-        known = measured_db is not None and np.any(measured_db > NO_PATH_DB)
-        power = (
-            coherent_alone()
-            if not known
-            else learn_shares(features, tx_index, powers, partial(nearness, measured_db), usual_spread_db)
-        )
+        if measured_db is not None and np.any(measured_db > NO_PATH_DB):
+            usual_spread_db = 1.0  # of the difference in error of two experts, over transmitters
+            power = learn_shares(features, tx_index, powers, partial(nearness, measured_db), usual_spread_db)
         report = {name: reported(shares, features) for name, shares in (("spectra", spectra), ("power", power))}
         weighted = mixing.field.with_shares(mixing.of(params), spectra, power, floor)
         return same._replace(params=mixing.put(params, weighted), report={"shares": report, "noise_floor": floor})
