@@ -57,11 +57,11 @@ class SurveyOptions:
     """Height and cells of readings, and their floor plan."""
 
     floor_plan: Path | None = None
-    """Walls as segments x1,y1,x2,y2 or corners x,y (.csv); by default those of the folder."""
+    """Walls x1,y1,x2,y2 or corners x,y (.csv); by default the folder's."""
     height: float | None = None
-    """Height of the transmitters (metres) if the readings have no z; by default 1.3."""
+    """Height of readings without z, metres; by default 1.3."""
     cell: float | None = None
-    """Side (metres) of the cells that readings are averaged over; by default 0.25."""
+    """Side of the cells that are averaged, metres; by default 0.25."""
 
     def survey_settings(self) -> dict[str, Any]:
         """Returns the arguments of `load_survey` that were given; what cannot be a length is a `UserError`."""
