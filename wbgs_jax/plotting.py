@@ -566,7 +566,7 @@ def draw_power_maps(learned: PowerMap, walls: Walls, cells: Readings) -> Figure:
     x, y = (np.arange(low[k] + spacing / 2, high[k], spacing) for k in range(2))
     pixels = np.stack([*(a.ravel() for a in np.meshgrid(x, y)), np.full(len(x) * len(y), height)], -1)
     powers = map_blocks(lambda block: received_power(learned, jnp.asarray(block, jnp.float32))[0], pixels, 2048)
-    titles = [f"receiver {r + 1}" for r in range(min(most_receivers, len(cells.receivers)))]
+    titles = cells.titles[:most_receivers]
     width, depth = 4.1 * (high - low) / max(high - low)
     figure, axes = _panels(titles, 3, (width, depth), sharex=True, sharey=True)
     norm = Normalize(*np.quantile(powers[:, : len(axes)], (0, 1)))
@@ -579,5 +579,5 @@ def draw_power_maps(learned: PowerMap, walls: Walls, cells: Readings) -> Figure:
         axis.plot(*cells.receivers[r, :2], **STAR)
     axes[0].legend(fontsize=8, loc="upper right")
     _name_axes(axes, "x [m]", "y [m]")
-    figure.colorbar(image, ax=axes, shrink=0.8, label=f"mean received power {height:.2g} m above the floor [dBm]")
+    figure.colorbar(image, ax=axes, shrink=0.8, label=f"mean received power [dBm]\n{height:.2g} m above the floor")
     return figure

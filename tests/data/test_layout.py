@@ -197,6 +197,19 @@ def test_a_point_cloud_without_faces(folder):
     assert (len(dataset.vertices), len(dataset.faces)) == (4, 0)
 
 
+@pytest.mark.parametrize("turned", [True, False])
+def test_a_point_cloud_in_the_frame_of_the_transmitters_is_refused(folder, turned):
+    points = np.array([*POSITIONS, (2, 1, 0.5)])
+    box = trimesh.creation.box(bounds=(points.min(0) - 0.5, points.max(0) + 0.5))
+    vertices = world_to_mesh(box.vertices) if turned else box.vertices
+    write_ply(folder / "point_cloud.ply", vertices.astype(np.float32), box.faces.astype(np.int32))
+    if turned:
+        assert len(load_layout(folder).faces) == 12
+    else:
+        with pytest.raises(UserError, match="they share one frame; write it as room.npz"):
+            load_layout(folder)
+
+
 # Bad input: one file of a good folder is spoilt; the message is one line that names the file and the trouble.
 
 

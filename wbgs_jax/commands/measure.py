@@ -152,6 +152,8 @@ def main(arguments: list[str] | None = None) -> None:
     survey = load_survey(command.data, **command.survey_settings())
     cells, size = survey.cells, survey.cell_m
     say(f"{len(cells.places)} cells of {size:g} m, {len(cells.receivers)} receivers, {len(walls.ends)} walls or faces of walls")
+    if cells.ids:
+        say(", ".join(cells.titles))
     for line in attribution(command.data):
         say(f"about the data: {line}")
     learned = learn_map(cells, walls)

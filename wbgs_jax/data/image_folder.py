@@ -172,6 +172,8 @@ def load_layout(
     gateway = read_gateway(folder / GATEWAY)
     tx_index = group_transmitters(positions)
     room = _read_room(folder)
+    if (folder / MESH).exists():
+        _check_axes(folder / MESH, room.vertices, np.vstack([positions, gateway.position]))
     if any((folder / name).exists() for name in INDEX.values()):
         split = _read_split(folder, tx_index, positions)
     else:
@@ -261,6 +263,20 @@ def _read_room(folder: Path) -> Room:
     vertices, faces = read_ply(mesh) if mesh.exists() else (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     arrays = {"vertices": mesh_to_world(vertices), "faces": faces, "face_part": np.zeros(len(faces), np.int32)}
     return Room(**check_mesh(arrays, str(mesh)))
+
+
+def _check_axes(path: Path, vertices: Float[np.ndarray, "v 3"], antennas: Float[np.ndarray, "n 3"]) -> None:
+    """Raises a `UserError` if antennas lie outside of a mapped mesh and all of them inside of it as it was written."""
+
+    def outside(points: Float[np.ndarray, "v 3"]) -> float:
+        return float(np.any((antennas < points.min(0)) | (antennas > points.max(0)), 1).mean())
+
+    many = 0.1  # share of antennas; a few stand outside of many rooms
+    if len(vertices) and outside(vertices) > many and not outside(world_to_mesh(vertices)):
+        raise UserError(
+            f"{path} surrounds the antennas as written, but not when turned from z-up to the layout's y-up frame: they share one "
+            f"frame; write it as {ROOM} instead (wbgs-jax convert)"
+        )
 
 
 def _read_images(folder: Path) -> UInt8[np.ndarray, "n 90 360"]:

@@ -153,6 +153,14 @@ class Readings:
     """Room of every position; empty if not specified."""
     receivers: Float[np.ndarray, "r 3"]
     """Metres."""
+    ids: tuple[str, ...] = ()
+    """Of the receivers; empty if not specified."""
+
+    @property
+    def titles(self) -> list[str]:
+        """Number of every receiver, counted from 1, with its id."""
+        ids = self.ids or ("",) * len(self.receivers)
+        return [f"receiver {number}" + f" ({own})" * bool(own) for number, own in enumerate(ids, 1)]
 
     def without(self, places: Bool[np.ndarray, " n"]) -> "Readings":
         """Returns the readings as if nothing had been received from the given positions (mask)."""
@@ -200,7 +208,8 @@ def _load_tables(folder: Path, height: float) -> Readings:
     # Names of columns that may identify a receiver.
     identifiers = ("id", "name", "receiver", "gateway", "anchor", "ap", "mac", "bssid")
     ids = next((names.index(name) for name in identifiers if name in names), None)
-    powers = match_columns(path, powers, len(receivers) if ids is None else [entry[ids] for entry in entries])
+    named = () if ids is None else tuple(entry[ids] for entry in entries)
+    powers = match_columns(path, powers, list(named) or len(receivers))
     places = numbers(path, header, rows, ["x", "y", "z"] if "z" in header else ["x", "y"])
     parts = [header.index(name) for name in room_columns if name in header]
     if places.shape[1] == 2 and set(room_columns[1:]) & set(header):
@@ -210,7 +219,7 @@ def _load_tables(folder: Path, height: float) -> Readings:
     rooms = tuple("/".join(row[part] for part in parts if row[part]) for row in rows)
     values = not_received(path, numbers(path, header, rows, powers))
     check_powers(path, values)
-    return Readings(places, values, np.isfinite(values).astype(float), rooms, receivers)
+    return Readings(places, values, np.isfinite(values).astype(float), rooms, receivers, named)
 
 
 def _checked(readings: Readings, folder: Path) -> Readings:
@@ -245,7 +254,7 @@ def cell_means(readings: Readings, size: float, highest: float = np.inf) -> Read
     totals = _sums(cell, n, np.where(received, readings.counts * np.nan_to_num(readings.powers), 0))
     powers = np.where(counts > 0, totals / np.maximum(counts, 1), np.nan)
     places = _sums(cell, n, readings.places) / np.bincount(cell)[:, None]
-    return Readings(places, powers, counts, tuple(names[cubes[:, -1]].tolist()), readings.receivers)
+    return Readings(places, powers, counts, tuple(names[cubes[:, -1]].tolist()), readings.receivers, readings.ids)
 
 
 def _sums(cell: Int[np.ndarray, " m"], n: int, values: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "n k"]:

@@ -251,14 +251,15 @@ def _worth(share: Share, known: Scored) -> Float[np.ndarray, " n"]:
 
 @jax.jit
 def _score_of(share: Share, features: Float[Array, "n features"], scores: Float[Array, "n shares"]) -> Float[Array, " n"]:
-    return score_at(scores, share_of(share, features))
+    return jnp.asarray(score_at(scores, share_of(share, features)))
 
 
-def score_at(scores: Float[Array, "n shares"], share: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Returns the score at a weight, interpolated linearly between those of `SHARES`."""
+def score_at(scores: Float[AnyArray, "n shares"], share: Float[AnyArray, " n"]) -> Float[AnyArray, " n"]:
+    """Returns the score at a weight, interpolated linearly between those of `SHARES`; on the host for NumPy arrays."""
     place = share * (len(SHARES) - 1)
-    low = jnp.clip(place.astype(jnp.int32), 0, len(SHARES) - 2)
-    left, right = (jnp.take_along_axis(scores, (low + step)[:, None], 1)[:, 0] for step in (0, 1))
+    low = place.astype(np.int32).clip(0, len(SHARES) - 2)
+    rows = np.arange(len(scores))
+    left, right = scores[rows, low], scores[rows, low + 1]
     return left + (place - low) * (right - left)
 
 

@@ -383,4 +383,4 @@ def choose_share(
 
 def _at(scores: Float[np.ndarray, "n shares"], share: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Returns the scores at weights, interpolated between those of `fields.mixture.SHARES`."""
-    return np.asarray(score_at(jnp.asarray(scores), jnp.asarray(share)), np.float64)
+    return np.asarray(score_at(scores.astype(np.float64), share))
