@@ -22,7 +22,7 @@ COMMANDS = {
         "wbgs_jax.commands.benchmark", "score any program's predictions for the test links of the released scenes"
     ),
     "predict": Entry("wbgs_jax.commands.predict", "predict spectra or channel quantities with a trained field, or export it"),
-    "map": Entry("wbgs_jax.commands.map", "predict maps over a floor: received power, best beams, K-factor, spreads"),
+    "map": Entry("wbgs_jax.commands.map", "predict maps over a floor: received power, SINR, beams, K-factor, spreads"),
     "move": Entry("wbgs_jax.commands.move", "predict a channel over time while antennas, people or furniture move"),
     "view": Entry("wbgs_jax.commands.view", "show a trained field in a browser: drag the transmitter, see paths and maps"),
     "next": Entry("wbgs_jax.commands.next", "choose where to measure next: where the field is most uncertain"),

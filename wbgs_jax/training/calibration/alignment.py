@@ -15,6 +15,7 @@ import dataclasses
 import itertools
 from dataclasses import dataclass
 from dataclasses import field as having
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +27,7 @@ from wbgs_jax._util.pytree import same
 from wbgs_jax.config import CalibrationConfig
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams
+from wbgs_jax.mesh.facets import centres
 from wbgs_jax.propagation.displacement import Motion
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.batches import TrainingData
@@ -85,9 +87,9 @@ class GeometryReport:
     """Shift of the receiver, the largest one of several receivers."""
     receiver_deg: float
     """Rotation of the receiver, the largest one of several receivers."""
-    bodies: list[dict[str, float]] = having(default_factory=list)
-    """For every rigid body its shift (mm) and the standard deviations (mm) of its position along the most and the least certain
-    direction; empty without snapshots."""
+    bodies: list[dict[str, Any]] = having(default_factory=list)
+    """For every rigid body its centre (metres, world frame), size and components of its shift (mm), its rotation vector (degrees),
+    and the standard deviations (mm) of its position along the most and the least certain direction; empty without snapshots."""
 
 
 @dataclass(frozen=True)
@@ -303,7 +305,7 @@ def _accepted(place: Place, moved: list[Place], observed: _Observed) -> tuple[Pl
     best = int(np.argmin([own.mean() for own in after]))
     kept = surely_better(before - after[best], tx, SURE)
     chosen = others[best]
-    sizes, bodies = _sizes(chosen.field.motion), _bodies(chosen.field.motion, chosen.known)
+    sizes, bodies = _sizes(chosen.field.motion), _bodies(chosen.field, chosen.known)
     unchanged = not kept or all(same(*(getattr(one.params, end) for one in (as_it_was, chosen))) for end in ENDS)
     report = GeometryReport(float(before.mean()), float(after[best].mean()), kept, unchanged, **sizes, bodies=bodies)
     return chosen if kept else as_it_was, report
@@ -333,15 +335,22 @@ def _known(
     return found
 
 
-def _bodies(motion: Motion, known: Float[np.ndarray, "m 3 3"] | None) -> list[dict[str, float]]:
-    """Returns the shift and the position uncertainty of every rigid body; an empty list without covariances."""
+def _bodies(field: Calibratable, known: Float[np.ndarray, "m 3 3"] | None) -> list[dict[str, Any]]:
+    """Returns place, displacement and position uncertainty of every rigid body; an empty list without covariances."""
     if known is None:
         return []
-    shifts = 1e3 * np.linalg.norm(np.asarray(motion.shift), axis=-1)
+    moved = 1e3 * np.asarray(field.motion.shift)
     off = 1e3 * np.sqrt(np.maximum(np.linalg.eigvalsh(known), 0))
-    names = "shift_mm", "best_known_mm", "least_known_mm"
-    rows = np.round(np.stack([shifts, off[:, 0], off[:, 2]], -1), 3).tolist()
-    return [dict(zip(names, row, strict=True)) for row in rows]
+    columns = {
+        "centre_m": np.asarray(centres(field.facets, len(moved))),
+        "shift_mm": np.linalg.norm(moved, axis=-1),
+        "moved_mm": moved,
+        "turned_deg": np.rad2deg(np.asarray(field.motion.turn)),
+        "best_known_mm": off[:, 0],
+        "least_known_mm": off[:, 2],
+    }
+    rows = zip(*(np.round(column.astype(float), 3).tolist() for column in columns.values()), strict=True)
+    return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
 def _retraced(now: Place, params: WaveParams, links: Links, data: TrainingData) -> Place:
