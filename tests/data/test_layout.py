@@ -206,7 +206,7 @@ def test_a_point_cloud_in_the_frame_of_the_transmitters_is_refused(folder, turne
     if turned:
         assert len(load_layout(folder).faces) == 12
     else:
-        with pytest.raises(UserError, match="they share one frame; write it as room.npz"):
+        with pytest.raises(UserError, match="they share one frame; write it as room"):
             load_layout(folder)
 
 

@@ -184,10 +184,10 @@ def test_columns_stand_in_any_order_and_headers_in_capitals(tmp_path, rng):
 def test_receivers_keep_their_ids(tmp_path, rng):
     folder(tmp_path, rng, n=20, noise=0.0)
     path = tmp_path / "receivers.csv"
-    header, *rows = [line.split(",", 1)[1] for line in path.read_text().splitlines()]
-    path.write_text("\n".join(["x,y,z" if "z" in header else header, *rows]))
+    lines = [line.split(",", 1)[1] for line in path.read_text().splitlines()]
+    path.write_text("\n".join(lines))
     assert load_readings(tmp_path, HEIGHT).titles == ["receiver 1", "receiver 2", "receiver 3"]
-    path.write_text("\n".join([f"id,{header}", *(f"{name},{row}" for name, row in zip(("a", "b", "c"), rows))]))
+    path.write_text("\n".join(f"{name},{line}" for name, line in zip(("id", "a", "b", "c"), lines, strict=True)))
     readings = tmp_path / "readings.csv"
     readings.write_text(readings.read_text().replace("rssi_3", "c").replace("rssi_1", "a").replace("rssi_2", "b"))
     assert cell_means(load_readings(tmp_path, HEIGHT), 0.5).titles == ["receiver 1 (a)", "receiver 2 (b)", "receiver 3 (c)"]

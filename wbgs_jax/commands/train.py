@@ -57,7 +57,7 @@ class Command:
     field: str = dataclasses.field(default_factory=default_field)
     """Model to train (docs/which_field.md)."""
     preset: str = "cpu"
-    """Size: smoke (two minutes, and one to evaluate), cpu (default without a GPU), gpu, or paper (wideband field only: as published)."""
+    """Size: smoke (minutes), cpu (default without a GPU), gpu, or paper (wideband field only: as published)."""
     seed: int = 0
     """Seed of all random numbers."""
     resume: bool = False

@@ -274,8 +274,8 @@ def _check_axes(path: Path, vertices: Float[np.ndarray, "v 3"], antennas: Float[
     many = 0.1  # share of antennas; a few stand outside of many rooms
     if len(vertices) and outside(vertices) > many and not outside(world_to_mesh(vertices)):
         raise UserError(
-            f"{path} surrounds the antennas as written, but not when turned from z-up to the layout's y-up frame: they share one "
-            f"frame; write it as {ROOM} instead (wbgs-jax convert)"
+            f"{path} surrounds the antennas as written, but not when turned from z-up to the layout's y-up frame: they share "
+            f"one frame; write it as {ROOM} instead (wbgs-jax convert)"
         )
 
 

@@ -88,8 +88,9 @@ class GeometryReport:
     receiver_deg: float
     """Rotation of the receiver, the largest one of several receivers."""
     bodies: list[dict[str, Any]] = having(default_factory=list)
-    """For every rigid body its centre (metres, world frame), size and components of its shift (mm), its rotation vector (degrees),
-    and the standard deviations (mm) of its position along the most and the least certain direction; empty without snapshots."""
+    """For every rigid body its centre (metres, world frame), size and components of its shift (mm), its rotation vector
+    (degrees), and the standard deviations (mm) of its position along the most and the least certain direction; empty without
+    snapshots."""
 
 
 @dataclass(frozen=True)
