@@ -154,7 +154,7 @@ class Readings:
     receivers: Float[np.ndarray, "r 3"]
     """Metres."""
     ids: tuple[str, ...] = ()
-    """Of the receivers; empty if not specified."""
+    """Ids of the receivers; empty if not specified."""
 
     @property
     def titles(self) -> list[str]:
