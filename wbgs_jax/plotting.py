@@ -468,12 +468,12 @@ def draw_channel(found: Mapping[str, np.ndarray], source: Mapping[str, Any], fre
     figure = Figure(figsize=(9, 6), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
     above.plot(found["time_s"], _amplitude_db(found["response"]), linewidth=1)
-    above.set(ylabel="received power [dB]")
+    above.set(ylabel="power [dB of the transmitted]")
     doppler = found["doppler_db"]
     bars = {"vmin": float(doppler.max()) - FADED_DB, "vmax": float(doppler.max())}
     shown = below.pcolormesh(found["doppler_time_s"], found["doppler_hz"], doppler, cmap=COLORS, shading="nearest", **bars)
     below.set(xlabel="time [s]", ylabel="Doppler shift [Hz]")
-    figure.colorbar(shown, ax=below, label="power [dB]", extend=_clipped(doppler, **bars))
+    figure.colorbar(shown, ax=below, label="power [dB of the transmitted]", extend=_clipped(doppler, **bars))
     figure.suptitle(f"{origin_words(source)}, {frequency_hz / 1e9:g} GHz", fontsize=9)
     return figure
 
@@ -518,9 +518,10 @@ def draw_maps(what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray,
     return figure
 
 
-def draw_distribution(what: str, answer: dict[str, np.ndarray]) -> Figure:
+def draw_distribution(what: str, answer: dict[str, np.ndarray], source: Mapping[str, Any]) -> Figure:
     """Returns a figure of the cumulative distribution of a quantity over the positions of its maps at which antennas can be
-    placed, one curve a frequency. Positions without any path count as lower than all others."""
+    placed, one curve a frequency. Positions without any path count as lower than all others. `source` is the provenance
+    (`LoadedField.source`)."""
     quantity = QUANTITIES[what]
     figure = Figure(figsize=(7, 4), layout="constrained")
     axis = figure.subplots()
@@ -530,6 +531,7 @@ def draw_distribution(what: str, answer: dict[str, np.ndarray]) -> Figure:
         share = (lower + 1 + np.arange(len(known))) / max(len(placed), 1)
         axis.step(known, share, where="post", label=f"{frequency / 1e9:g} GHz")
     axis.set(xlabel=quantity.label, ylabel="share of the positions", ylim=(0, 1))
+    axis.set_title(origin_words(source), fontsize=9)
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8)
     return figure

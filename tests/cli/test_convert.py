@@ -95,6 +95,8 @@ def test_a_model_without_an_answer(tmp_path):
         (["room.glb", "--out", "a.ply"], ["a.ply does not end in .npz"]),
         (["room.glb", "--out", "a.npz"], ["scene file room.glb does not exist"]),
         (["--run", "RUN", "--out", "a.ply"], ["--tx", "--ghz 28"]),
+        (["--example", "--out", "a.ply"], ["--tx", "--ghz 28"]),
+        (["--run", "RUN", "--example", "--out", "a.ply"], ["give one of --run RUN and --example"]),
         (["--run", "RUN", "--tx", "1,0,1", "--ghz", "28", "--out", "a.obj"], ["a.obj", "gaussians.ply"]),
         (["--run", "RUN", "--tx", "1,0,1", "--ghz", "28", "--out", "a.npz"], ["does not predict paths"]),
         (["--paths", "gone", "--ghz", "28", "--out", "a.npz"], ["cannot read gone"]),

@@ -247,7 +247,9 @@ def test_errors_have_a_scale_of_their_own(dataset):
 
 def test_the_distribution_counts_links_without_paths_as_lower_and_single_paths_as_higher():
     answer = {"k_factor_db": np.array([[[np.nan, 3.0], [np.inf, 1.0]]]), "frequencies_hz": HERTZ[:1]}
-    (curve,) = draw_distribution("k-factor", answer | {"no_confidence": np.zeros((2, 2), bool)}).axes[0].lines
+    (axis,) = draw_distribution("k-factor", answer | {"no_confidence": np.zeros((2, 2), bool)}, SOURCE).axes
+    (curve,) = axis.lines
+    assert SOURCE["scene"] in axis.get_title()
     np.testing.assert_allclose(curve.get_xydata(), [[1, 0.5], [3, 0.75]])
 
 

@@ -1,7 +1,7 @@
 """Convert a trained field for other programs, or their paths and models to files for training:
 
 wbgs-jax convert --run RUN --tx x,y,z --ghz 28 --out gaussians.ply          Gaussians, for splat viewers
-wbgs-jax convert --run RUN --tx x,y,z [x,y,z ...] --ghz 28 --out paths.npz  paths as arrays of sionna.rt.Paths
+wbgs-jax convert --example --tx x,y,z [x,y,z ...] --ghz 28 --out paths.npz  paths as arrays of sionna.rt.Paths
 wbgs-jax convert --run RUN --grid LOW:HIGH:NXxNYxNZ --ghz 28 --out folder   a DeepMIMO scenario
 wbgs-jax convert --paths sionna.npz --array 4x4 --out scene.npz             paths of Sionna RT as a scene file
 wbgs-jax convert --paths scenario --ghz 28 --array 4x4 --out scene.npz      a DeepMIMO scenario as a scene file
@@ -25,7 +25,7 @@ from wbgs_jax._util.cli import parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import check_writable
-from wbgs_jax.commands.options import check_effects, load_field, parse_frequencies, warn
+from wbgs_jax.commands.options import EXAMPLE, check_effects, load_field, parse_frequencies, warn
 from wbgs_jax.inference.queries import parse_array, parse_grid
 
 # Modules that load JAX are imported where they are used, as in predict.py.
@@ -49,9 +49,11 @@ class Command:
     out: Path
     """Output. With --run: .ply (Gaussians), .npz (paths) or a folder (DeepMIMO); otherwise a scene or room file, .npz."""
     model: tyro.conf.Positional[Path | None] = None
-    """Input, one of three: a model of a room (.glb, .gltf, .obj, .ply, or .xml of Sionna RT), ..."""
+    """Input, one of four: a model of a room (.glb, .gltf, .obj, .ply, or .xml of Sionna RT), ..."""
     run: Path | None = None
     """... the run folder of a trained field, ..."""
+    example: tyro.conf.FlagCreatePairsOff[bool] = False
+    """... the trained field in the package, of scene 1, ..."""
     paths: Path | None = None
     """... or paths: an .npz file with the arrays of sionna.rt.Paths, or a DeepMIMO scenario (folder, .npz, .mat)."""
     materials: Path | None = None
@@ -67,7 +69,7 @@ class Command:
     ghz: float | None = None
     """Frequency; with --paths only if the file lacks it."""
     rx: str = ""
-    """Run: the receiver, by default the first (see `wbgs-jax predict --help`)."""
+    """Run: the receiver (see `wbgs-jax predict --help`)."""
     array: str = ""
     """Paths: the receivers' array, ROWSxCOLUMNS elements half a wavelength apart; by default that of the file, else 4x4."""
     port: int | None = None
@@ -85,19 +87,24 @@ class Command:
     rx_set: int | None = None
     """... and of the set of users."""
 
+    @property
+    def folder(self) -> Path | None:
+        """The folder of the trained field that is converted, if any."""
+        return EXAMPLE if self.example else self.run
+
 
 def check(command: Command) -> None:
     """Raises a `UserError` for an invalid command line."""
-    if [command.run, command.paths, command.model].count(None) != 2:
+    if [command.run, command.example or None, command.paths, command.model].count(None) != 3:
         raise UserError(
-            "give one of --run RUN, to convert a trained field, --paths FILE, to create a scene file from paths, or a model "
-            "such as room.glb, to create a room file"
+            "give one of --run RUN and --example, to convert a trained field, --paths FILE, to create a scene file from paths, "
+            "or a model such as room.glb, to create a room file"
         )
-    kinds = (RUN,) if command.run else (MODEL,) if command.model else (SIONNA, DEEPMIMO)
+    kinds = (RUN,) if command.folder else (MODEL,) if command.model else (SIONNA, DEEPMIMO)
     check_effects(command, KINDS, kinds, " or ".join(kinds))
-    if command.run is None and command.out.suffix != ".npz":
+    if command.folder is None and command.out.suffix != ".npz":
         raise UserError(f"--out {command.out} does not end in .npz, as scene files and room files must")
-    if command.run is None:
+    if command.folder is None:
         return
     if bool(command.tx) == bool(command.grid) or command.ghz is None:
         raise UserError("--run needs transmitters and a frequency: give either --tx x,y,z or --grid, and --ghz 28")
@@ -107,10 +114,10 @@ def check(command: Command) -> None:
 
 def hand_on(command: Command) -> str:
     """Writes the Gaussians or paths of a trained field, and returns a line for the user."""
-    assert command.run is not None and command.ghz is not None, "checked"
+    assert command.folder is not None and command.ghz is not None, "checked"
     positions = parse_grid(command.grid) if command.grid else parse_positions(command.tx)
     hertz = parse_frequencies((command.ghz,))
-    field = load_field(command.run, command.rx, float(hertz[0]))
+    field = load_field(command.folder, command.rx, float(hertz[0]))
     warn(field.domain, field.receiver.position, positions, hertz, 3)
     write = _write_gaussians if command.out.suffix == ".ply" else _write_paths
     return write(command, field.trained, field.receiver, positions, float(hertz[0]))
@@ -151,7 +158,7 @@ def _write_paths(
     paths = from_paths(found, positions, np.asarray(receiver.position), frequency_hz)
     if command.out.suffix == ".npz":
         save_paths(command.out, paths)
-        return f"paths: {command.out} ({paths.valid.sum()} of {len(positions)} transmitters)"
+        return f"paths: {command.out} ({paths.valid.sum()} paths, transmitters: {len(positions)})"
     write_deepmimo(command.out, as_deepmimo(paths.reversed()), frequency_hz)
     return f"DeepMIMO scenario: {command.out} (the receiver as base station, {len(positions)} transmitters as users)"
 
@@ -214,7 +221,7 @@ def main(arguments: list[str] | None = None) -> None:
     check(command)
     check_writable(command.out if command.out.suffix else command.out / "scenario")
     use_compilation_cache()
-    job = take_in if command.paths is not None else take_room if command.run is None else hand_on
+    job = take_in if command.paths is not None else take_room if command.folder is None else hand_on
     say(job(command))
 
 

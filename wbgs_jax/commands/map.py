@@ -196,7 +196,7 @@ def make_maps(command: Command) -> None:
             save(draw_maps(command.what, answer, cut_at(field.dataset, plane.height), field.source), command.picture)
             say(f"picture: {command.picture}")
         if command.cdf:
-            save(draw_distribution(command.what, answer | {"no_confidence": outside}), command.cdf)
+            save(draw_distribution(command.what, answer | {"no_confidence": outside}, field.source), command.cdf)
             say(f"distribution: {command.cdf}")
 
 
