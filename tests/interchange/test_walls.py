@@ -6,7 +6,7 @@ import trimesh
 
 from wbgs_jax.data.scene import _obstructed
 from wbgs_jax.mesh.polygons import triangulate
-from wbgs_jax.mesh.walls import walls_as_sheets
+from wbgs_jax.mesh.walls import divided, hidden_walls, walls_as_sheets
 
 
 def block(low, high):
@@ -114,6 +114,33 @@ def test_bodies_that_are_no_walls_stay(rng):
     ]  # fmt: skip
     meshes, walls = walls_as_sheets(bodies)
     assert walls == [0] * len(bodies) and all(one is other for one, other in zip(meshes, bodies, strict=True))
+
+
+@pytest.mark.parametrize("ends", [(0.2, 0.0), (0.2, 0.2), (-0.2, 0.2)])
+def test_walls_with_mitred_ends_are_walls(ends):
+    outline = [(0, 0), (5, 0), (5 - ends[1], 0.2), (ends[0], 0.2)]
+    wall = trimesh.convex.convex_hull([(x, y, z) for x, y in outline for z in (0, 2.7)])
+    (mesh,), thickness = walls_as_sheets([wall])
+    assert thickness == pytest.approx([0.2]) and np.ptp(mesh.vertices[:, 1]) < 1e-9
+
+
+def test_the_walls_of_one_name_are_divided_by_their_thickness():
+    """As in models whose objects have the name of their class; a cupboard stays a body."""
+    thin, thick = block((0, 0, 0), (4, 0.1, 2.7)), block((5, 0, 0), (9, 0.3, 2.7))
+    cupboard = block((0, 3, 0), (1, 3.6, 2))
+    pieces = divided(trimesh.util.concatenate([thick, cupboard, thin]))
+    meshes, walls = walls_as_sheets(pieces)
+    assert sorted(walls) == pytest.approx([0, 0.1, 0.3])
+    assert sorted(mesh.area for mesh in meshes) == pytest.approx([7.6, 10.8, 10.8])
+    for whole in (trimesh.util.concatenate([thin, thin.copy().apply_translation((0, 9, 0))]), cupboard):
+        assert divided(whole) == [whole]
+
+
+def test_walls_in_one_piece_are_reported():
+    corner = prism([(0, 0), (5, 0), (5, 0.2), (0.2, 0.2), (0.2, 4), (0, 4)], 0, 2.7)
+    corner.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, (0, 1, 0)))
+    assert hidden_walls(corner) == pytest.approx(0.2, rel=0.1)
+    assert not any(map(hidden_walls, (block((0, 0, 0), (1.2, 0.6, 2)), block((0, 0, 0), (3, 2, 2.7)))))
 
 
 def test_several_segments_of_one_object_are_sheets():

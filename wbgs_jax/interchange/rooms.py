@@ -12,7 +12,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import Room, load_room
 from wbgs_jax.interchange.room_materials import Slab, slabs_of
 from wbgs_jax.mesh.importers import FileObject, read_objects
-from wbgs_jax.mesh.walls import walls_as_sheets
+from wbgs_jax.mesh.walls import divided, hidden_walls, walls_as_sheets
 
 MAX_TRIANGLES = 2_000_000
 SHOWN = 40
@@ -67,6 +67,7 @@ def read_room(
     found = [RoomObject(one.name, one.mesh, slab) for one, slab in zip(objects, slabs, strict=True)]
     if simulated:
         return found
+    found = [replace(one, mesh=mesh) for one in found for mesh in divided(one.mesh)]
     meshes, walls = walls_as_sheets([one.mesh for one in found], antennas)
     return [_as_wall(one, mesh, wall) for one, mesh, wall in zip(found, meshes, walls, strict=True)]
 
@@ -102,6 +103,12 @@ def describe_room(objects: Sequence[RoomObject], sorts: Sequence[str]) -> str:
     lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
     if len(rows) < len(objects):
         lines.append(f"... and {len(objects) - len(rows)} smaller objects")
+    for one in objects:
+        if depth := hidden_walls(one.mesh):
+            lines.append(
+                f"warning: {one.name} has walls about {depth:.2g} m thick with two faces, and both attenuate waves: divide it "
+                "into straight walls, or keep only its inner face"
+            )
     total = sum(len(one.mesh.faces) for one in objects)
     # Number of triangles from which finding paths takes long; furniture in such detail does not change the paths.
     many_triangles = 20_000

@@ -21,6 +21,8 @@ FLAT = 1e-3
 """Metres: maximum distance of corners from the plane of a face, and of the corners of a side from a line."""
 PARALLEL = 0.999
 """Minimum cosine between the normals of one face."""
+SAME_DEPTH = 1.1
+"""Maximum ratio between thicknesses that count as the same."""
 NEAR = 0.02
 """Maximum distance between touching bodies, metres."""
 
@@ -80,6 +82,31 @@ def walls_as_sheets(
     return results, [float(np.median([sheet.thickness for sheet in own])) if own else 0.0 for own in walls]
 
 
+def divided(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+    """Returns the walls of a mesh, one mesh for each thickness, and the rest; the mesh itself if it is all of one kind.
+    Programs that name objects by their class give one name to walls of several thicknesses."""
+    bodies = list(mesh.split(only_watertight=False)) if mesh.is_watertight else []
+    found = [_wall(body, body.bounds.mean(0)[None]) for body in bodies]
+    panel = 0.05  # metres: thickness below which a body is a panel of furniture
+    depths = [0.0 if wall is None or wall.thickness < panel else wall.thickness for wall in found]
+    kinds: list[list[int]] = []
+    for i in np.argsort(depths, kind="stable"):
+        if not kinds or depths[i] > SAME_DEPTH * depths[kinds[-1][0]]:
+            kinds.append([])
+        kinds[-1].append(int(i))
+    pieces = [trimesh.util.concatenate([bodies[i] for i in kind]) for kind in kinds] if len(kinds) > 1 else [mesh]
+    return [piece for piece in pieces if isinstance(piece, trimesh.Trimesh)]
+
+
+def hidden_walls(mesh: trimesh.Trimesh) -> float:
+    """Returns the mean thickness (metres) of a closed body as large as a room whose walls have two faces; 0 for all others."""
+    floor, height, thickest = 1.0, 1.5, 0.3  # metres: least horizontal and vertical extent, and largest mean thickness
+    if not mesh.is_watertight or (mesh.extents < (floor, floor, height)).any():
+        return 0.0
+    depth = 2 * abs(float(mesh.volume)) / float(mesh.area)
+    return depth if depth < thickest else 0.0
+
+
 def _walls(mesh: trimesh.Trimesh, places: Float[np.ndarray, "n 3"]) -> list[Sheet]:
     """Returns a sheet for every body of a mesh; none unless all bodies are walls of equal thickness within 10 %."""
     if not mesh.is_watertight:
@@ -87,7 +114,7 @@ def _walls(mesh: trimesh.Trimesh, places: Float[np.ndarray, "n 3"]) -> list[Shee
     found = [_wall(body, places) for body in mesh.split(only_watertight=False)]
     sheets = [sheet for sheet in found if sheet is not None]
     thickness = [sheet.thickness for sheet in sheets]
-    return sheets if sheets and len(sheets) == len(found) and max(thickness) < 1.1 * min(thickness) else []
+    return sheets if sheets and len(sheets) == len(found) and max(thickness) < SAME_DEPTH * min(thickness) else []
 
 
 def _wall(body: trimesh.Trimesh, places: Float[np.ndarray, "n 3"]) -> Sheet | None:
@@ -101,10 +128,14 @@ def _wall(body: trimesh.Trimesh, places: Float[np.ndarray, "n 3"]) -> Sheet | No
     top, bottom = (flat & (np.abs(heights[:, 0] - level) < FLAT) for level in (heights.max(), heights.min()))
     thickness = float(np.ptp(heights))
     thickest = 0.6  # maximum thickness of a wall or floor, metres
-    unequal = 0.02  # maximum relative difference between the areas of the two faces
-    if not 0 < thickness <= thickest or abs(areas[top].sum() - areas[bottom].sum()) > unequal * areas[top].sum():
+    faces = np.array([areas[top].sum(), areas[bottom].sum()])
+    least = 0.25  # minimum ratio between the areas of the two faces
+    if not 0 < thickness <= thickest or faces.min() <= least * faces.max():
         return None
     sheet = _sheet(body, top, normal, thickness)
+    unequal = 0.02  # maximum relative difference between the areas, besides that of two mitred ends
+    if np.ptp(faces) > unequal * faces[0] + 2 * thickness * float(np.ptp(sheet.vertices @ sheet.axes().T, axis=0).max()):
+        return None
     axes = np.stack([normal, *sheet.axes()])
     own, others = body.vertices @ axes.T, places @ axes.T
     away = np.maximum(np.maximum(own.min(0) - others, others - own.max(0)), 0)
