@@ -281,12 +281,20 @@ def check(settings: Settings) -> None:
         "loop.keep-checkpoints": loop.keep_checkpoints,
     }
     check_positive(positive | ({"calibration.spectra": settings.calibration.spectra} if settings.calibration else {}))
-    check_share("optim.share-with-paths", optim.share_with_paths)
+    for name in ("share_with_paths", "warmup", "final_fraction", "curriculum", "virtual"):
+        check_share(f"optim.{name.replace('_', '-')}", getattr(optim, name))
+    if optim.max_epochs < 0:
+        raise UserError(f"--optim.max-epochs is {optim.max_epochs}; it must be at least 0")
     if optim.steps % loop.epoch_steps:
         raise UserError(
             f"--optim.steps {optim.steps} is not a multiple of --loop.epoch-steps {loop.epoch_steps}; change one of them"
         )
-    if (density := settings.density) and density.every < density.stop_fraction * optim.steps:
+    if density := settings.density:
+        check_positive({"density.max-gaussians": density.max_gaussians})
+        check_share("density.prune-attenuation", density.prune_attenuation)
+        if not 0 < density.reset_attenuation < 1:  # its logit is computed
+            raise UserError(f"--density.reset-attenuation is {density.reset_attenuation}; it must lie strictly between 0 and 1")
+    if density and density.every < density.stop_fraction * optim.steps:
         for name, every in (("every", density.every), ("reset-every", density.reset_every)):
             if every % loop.epoch_steps:  # it would never be due at the end of an epoch
                 raise UserError(
@@ -305,3 +313,10 @@ def check_share(name: str, value: float) -> None:
     """Raises a `UserError` unless an option's value lies between 0 and 1."""
     if not 0 <= value <= 1:
         raise UserError(f"--{name} is {value}; it must lie between 0 and 1")
+
+
+def check_rates(name: str, config: Any) -> None:
+    """Raises a `UserError` for the first negative learning rate, `<group>_lr`, of the settings of the field of this name."""
+    for f in dataclasses.fields(config):
+        if f.name.endswith("_lr") and getattr(config, f.name) < 0:
+            raise UserError(f"--{name}.{f.name.replace('_', '-')} is {getattr(config, f.name)}; it must be at least 0")

@@ -21,7 +21,8 @@ from wbgs_jax.evaluation.score import watch
 from wbgs_jax.training import curves
 from wbgs_jax.training.checkpoint import checkpoint_steps
 from wbgs_jax.training.loop import Run
-from wbgs_jax.training.run_folder import load_trained
+from wbgs_jax.training.progress import Interrupted
+from wbgs_jax.training.run_folder import load_trained, read_config, write_config
 
 pytestmark = pytest.mark.usefixtures("ripple")
 
@@ -256,12 +257,40 @@ def test_training_from_python_is_the_command(tmp_path, layout, trained):
         ({"settings": {"optim": {"stepz": 3}}}, "a setting is unknown .*stepz"),
         ({"settings": {"optics": {"steps": 3}}}, "a setting is unknown .*optics"),
         ({"seeds": 3}, "an option is unknown .*seeds"),
+        ({"seed": 3.0}, "--seed is 3.0; give a whole number"),
+        ({"train_tx": 40.0}, "--train-tx is 40.0; give a whole number"),
+        ({"settings": {"optim": {"steps": 40.0}}}, "--optim.steps is 40.0; give a whole number"),
+        ({"settings": {"optim": {"batch": "4"}}}, "--optim.batch is '4'; give a whole number"),
+        ({"settings": {"loop": {"epoch_steps": True}}}, "--loop.epoch-steps is True; give a whole number"),
+        ({"field": "wideband", "settings": {"wideband": {"frequency_scale": "GHz"}}}, "--wideband.frequency-scale is 'GHz'"),
+        ({"field": "hybrid", "settings": {"wideband": {"precision": "float16"}}}, "--wideband.precision .*'bfloat16'"),
+        ({"field": "wideband", "settings": {"wideband": {"relative": 1}}}, "--wideband.relative is 1; give True or False"),
+        ({"field": "nerf2", "settings": {"nerf2": {"network_optimizer": "sgd"}}}, "'sgd'; give 'adam' or 'muon'"),
+        ({"field": "nerf2", "settings": {"nerf2": {"network_lr": np.nan}}}, "--nerf2.network-lr is nan; give a finite number"),
+        ({"distributed": True}, "--distributed in every process"),
     ],
 )
 def test_what_cannot_be_trained_from_python(tmp_path, scene, given, words):
     with pytest.raises(UserError, match=words):
         wbgs_jax.train_field(scene, tmp_path / "run", **({"field": "ripple", "preset": "smoke"} | given))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_lists_and_numpy_numbers_are_taken_as_plain_values(tmp_path, scene, monkeypatch):
+    taken = []
+
+    def stopped(*both):
+        taken.append(train_command.run_config(*both))
+        raise Interrupted
+
+    monkeypatch.setattr(train_command, "_train", stopped)
+    settings = {"nerf2": {"radiance_widths": [32]}, "optim": {"steps": np.int64(50), "warmup": np.float32(0.25)}}
+    with pytest.raises(Interrupted):
+        wbgs_jax.train_field(scene, tmp_path, "nerf2", "cpu", settings, seed=np.int64(3), train_ghz=np.array([2.4, 5.0]))
+    (config,) = taken
+    write_config(tmp_path, config)
+    assert read_config(tmp_path) == config
+    assert config.settings.field.radiance_widths == (32,) and config.train_ghz == (2.4, 5.0)
 
 
 def test_earlier_names_of_options_mean_the_present_ones():

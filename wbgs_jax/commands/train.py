@@ -19,6 +19,7 @@ import tyro
 
 from wbgs_jax._util.cli import option_value, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
+from wbgs_jax._util.declared_types import misfits, plain
 from wbgs_jax._util.devices import by_first, connect, is_first
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.progress_lines import Pulse
@@ -218,20 +219,34 @@ def train_field(
     Example:
         >>> run = train_field("1", "runs/short", preset="smoke", settings={"optim": {"steps": 100}})  # doctest: +SKIP
     """
-    where: Any = {"data": str(source)} if Path(str(source).split(",")[0]).is_dir() else {"scene": str(source)}
+    where = "data" if Path(str(source).split(",")[0]).is_dir() else "scene"
+    given: Any = {where: str(source), "out": Path(out), "field": field or default_field(), "preset": preset or default_preset()}
     try:
-        command = Command(**where, out=Path(out), field=field or default_field(), preset=preset or default_preset(), **options)
+        command = Command(**given, **_of_types(Command, options))
     except TypeError as error:
         known = ", ".join(f.name for f in dataclasses.fields(Command))
         raise UserError(f"an option is unknown ({error}); those of train_field are {known}") from error
+    if command.distributed:
+        raise UserError(f"distributed is an option of the command line alone; run {PROGRAM} --distributed in every process")
     default = preset_of(command.field, command.preset)
     parts = sections(default, command.field)
     try:
-        changed = {name: dataclasses.replace(parts[name], **values) for name, values in (settings or {}).items()}
-    except (KeyError, TypeError) as error:
+        changed = {
+            name: dataclasses.replace(parts[name], **_of_types(type(parts[name]), values, f"{name}."))
+            for name, values in (settings or {}).items()
+        }
+    except (KeyError, TypeError, AttributeError) as error:
         raise UserError(f"a setting is unknown ({error}); {PROGRAM} --help-settings lists all of them") from error
     _train(command, from_sections(parts | changed, default, command.field))
     return load_trained(out)
+
+
+def _of_types(cls: type, values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Returns values for fields of a dataclass as read from a file, or raises a `UserError` for one that no file may hold."""
+    values = {name: plain(value) for name, value in values.items()}
+    for name, wanted in misfits(cls, values).items():
+        raise UserError(f"--{(prefix + name).replace('_', '-')} is {repr(values[name])[:60]}; give {wanted}")
+    return values
 
 
 def _train(command: Command, settings: Settings) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.config import PRESETS as COMMON
-from wbgs_jax.config import CalibrationConfig, Settings, check_positive
+from wbgs_jax.config import CalibrationConfig, Settings, check_positive, check_rates
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,7 @@ class WaveConfig:
         max_facets = 100_000
         if self.max_facets > max_facets:
             raise UserError(f"--{name}.max-facets is {self.max_facets}; the most is {max_facets}")
+        check_rates(name, self)
         check_positive({f"{name}.ssim-stride": self.ssim_stride})
         if self.clutter_cells < 1 or self.clutter_cell <= 0:
             raise UserError(

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree, static
-from wbgs_jax.config import PRESETS, check_positive
+from wbgs_jax.config import PRESETS, check_positive, check_rates
 from wbgs_jax.fields.base import Aux, Field, Group, Observation, Optimizer, register, with_field
 from wbgs_jax.fields.losses import pixel_loss
 from wbgs_jax.fields.networks import (
@@ -82,6 +82,7 @@ class Nerf2Config:
         check_positive({f"{name}.radiance-widths": min(self.radiance_widths, default=0)})
         if self.directions > PIXELS:
             raise UserError(f"--{name}.directions is {self.directions}; a spectrum has {PIXELS} pixels")
+        check_rates(name, self)
         check_octaves(name, self, ("point", "direction", "tx", "frequency"))
 
 

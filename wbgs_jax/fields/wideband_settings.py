@@ -3,7 +3,17 @@
 from dataclasses import dataclass
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.config import PRESETS, DensityConfig, LoopConfig, OptimConfig, Settings, check_positive, check_share, setting
+from wbgs_jax.config import (
+    PRESETS,
+    DensityConfig,
+    LoopConfig,
+    OptimConfig,
+    Settings,
+    check_positive,
+    check_rates,
+    check_share,
+    setting,
+)
 from wbgs_jax.fields.base import Optimizer
 from wbgs_jax.fields.networks import FrequencyScale, Precision, check_octaves
 from wbgs_jax.radio.geometry import Projection
@@ -92,6 +102,7 @@ class WidebandConfig:
             raise UserError(f"--{name}.gaussians is {self.gaussians}; give at least 4, or 0 for the size of the mesh")
         if not 0 <= self.fusion < self.depth:
             raise UserError(f"--{name}.fusion is {self.fusion}; it is the number of a layer, 0 to {self.depth - 1}")
+        check_rates(name, self)
         check_octaves(name, self, ("gaussian", "tx", "frequency"))
         if self.frequency_degree < 1 or self.frequency_heads < 0:
             raise UserError(f"--{name}.frequency-degree must be at least 1, --{name}.frequency-heads at least 0")

@@ -8,11 +8,8 @@ There is one training per folder: two would overwrite each other's curves and ch
 
 import contextlib
 import dataclasses
-import math
 import os
 import platform
-import types
-import typing
 import warnings
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
@@ -23,6 +20,7 @@ import jax
 import jax.numpy as jnp
 
 import wbgs_jax
+from wbgs_jax._util.declared_types import misfits
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import left_by_killed, read_json, write_json
 from wbgs_jax._util.pytree import replaced
@@ -82,40 +80,8 @@ def read_config(folder: Path) -> RunConfig:
 
 
 def _demand_types(path: Path, value: Any, prefix: str) -> None:
-    if wrong := _misfit(value):
-        raise UserError(f"{path} is damaged ({prefix}{wrong}); correct it, or train again")
-
-
-def _misfit(value: Any) -> str:
-    """Returns the first field of a dataclass whose value does not have the declared type, as "NAME is VALUE"; empty if all do.
-    Fields that are dataclasses or of any type are not checked; numbers must be finite."""
-    hints = typing.get_type_hints(type(value))
-    for field in dataclasses.fields(value):
-        content = getattr(value, field.name)
-        if not _fits(content, hints[field.name]):
-            return f"{field.name} is {repr(content)[:60]}"
-    return ""
-
-
-def _fits(value: Any, declared: Any) -> bool:
-    """Returns whether a value has a declared type: plain types, tuples, literals, and unions of these."""
-    origin, arguments = typing.get_origin(declared), typing.get_args(declared)
-    if declared is Any or dataclasses.is_dataclass(declared):
-        return True
-    if origin in (typing.Union, types.UnionType):
-        return any(_fits(value, one) for one in arguments)
-    if origin is typing.Literal:
-        return value in arguments
-    if origin is tuple:
-        inner = arguments[:1] * len(value) if isinstance(value, tuple) and arguments[-1] is Ellipsis else arguments
-        return isinstance(value, tuple) and len(value) == len(inner) and all(map(_fits, value, inner))
-    if declared is float:
-        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300 and math.isfinite(value)
-    if declared is int:
-        return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
-    if declared is type(None):
-        return value is None
-    return isinstance(value, declared) if isinstance(declared, type) else True
+    for name in misfits(type(value), vars(value)):
+        raise UserError(f"{path} is damaged ({prefix}{name} is {repr(getattr(value, name))[:60]}); correct it, or train again")
 
 
 def prepare_folder(folder: Path, config: RunConfig, resume: bool) -> None:
