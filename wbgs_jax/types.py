@@ -4,7 +4,7 @@ SI units: metres, hertz, radians. Constructors check their arguments; arrays are
 """
 
 import dataclasses
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -250,15 +250,22 @@ def make_receiver(
     Returns:
         The receiver, without a leading axis.
 
+    Raises:
+        ValueError: the unit is unknown, a shape is wrong, or the quaternion has zero length.
+
     Example:
         >>> make_receiver([0.0, 0.0, 2.0]).element_positions.shape
         (16, 3)
     """
+    if unit not in get_args(ElementUnit):
+        raise ValueError(f"unit is {unit!r}; give one of: {', '.join(get_args(ElementUnit))}")
     elements = planar_array() if element_positions is None else element_positions
     quaternion = np.asarray(orientation, np.float64)
-    quaternion = quaternion / np.linalg.norm(quaternion)
+    quaternion = quaternion / (np.linalg.norm(quaternion) or 1.0)  # zero length is refused below
     arrays = [jnp.asarray(np.asarray(a), jnp.float32) for a in (position, quaternion, elements, pattern_exponents(pattern))]
-    return Receiver(arrays[0], arrays[1], arrays[2], antenna or Antenna(None, arrays[3]), unit)
+    receiver = Receiver(arrays[0], arrays[1], arrays[2], antenna or Antenna(None, arrays[3]), unit)
+    check_receiver(receiver)
+    return receiver
 
 
 def stack_receivers(receivers: list[Receiver]) -> Receiver:
@@ -269,7 +276,16 @@ def stack_receivers(receivers: list[Receiver]) -> Receiver:
 
     Returns:
         The receivers, with arrays (r, ...).
+
+    Raises:
+        ValueError: there are none, or they differ in the unit, the number of elements or the kind of antenna.
     """
+    if not receivers:
+        raise ValueError("receivers is empty; give at least one")
+    if len({(jax.tree.structure(one), one.element_positions.shape) for one in receivers}) > 1:
+        raise ValueError(
+            "receivers differ in the unit, the number of elements or the kind of antenna; give receivers of one kind"
+        )
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *receivers)
 
 
@@ -345,6 +361,7 @@ def check_receiver(receiver: Receiver) -> None:
     check_array("receiver.position", receiver.position, (3,))
     check_array("receiver.orientation", receiver.orientation, (4,))
     check_array("receiver.element_positions", receiver.element_positions, ("elements", 3))
+    check_array("receiver.antenna.exponents", receiver.antenna.exponents, (2,))
     orientation = concrete(receiver.orientation)
     if orientation is not None and not np.linalg.norm(orientation) > 1e-6:
         raise ValueError("receiver.orientation has zero length; pass a quaternion (w, x, y, z), (1, 0, 0, 0) for no rotation")

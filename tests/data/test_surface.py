@@ -1,5 +1,7 @@
 """Where Gaussians start."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -141,3 +143,18 @@ def test_points_are_no_mesh(vertices):
     with pytest.raises(UserError, match=r"room has no mesh.*give a scene with a mesh") as error:
         make_mesh(room(with_faces=False, with_vertices=vertices))
     assert "\n" not in str(error.value)
+
+
+def test_too_few_points_and_unknown_samplings_are_refused():
+    for count in (-1, 3):
+        with pytest.raises(ValueError, match=f"count is {count}; give at least 4, or 0"):
+            make_surface(room(), count, 0)
+    with pytest.raises(ValueError, match=r"points has shape \(3, 3\); expected \(n, 3\) with n at least 4"):
+        surface_from_points(np.eye(3))
+
+
+def test_a_cloud_of_too_few_points_counts_as_none():
+    few = room(with_faces=False)
+    few = dataclasses.replace(few, vertices=few.vertices[:3])
+    surface = make_surface(few, 50, 0)
+    assert surface.points.shape == (50, 3) and np.isfinite(surface.spacing).all()

@@ -1,5 +1,7 @@
 """A trained field as a function: the same answers as the field itself, any leading axes, gradients, blocks, maps."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,9 +16,11 @@ from wbgs_jax.fields.base import portable
 from wbgs_jax.inference import predictor as inference
 from wbgs_jax.inference.batching import map_queries, predict_blocks, predict_many, predict_map
 from wbgs_jax.inference.predictor import make_predictor
+from wbgs_jax.inference.trained_field import at_receiver, receiver_number
+from wbgs_jax.radio.antenna import Pattern
 from wbgs_jax.splat import TileLimits
 from wbgs_jax.training.run_folder import load_trained
-from wbgs_jax.types import Query, make_query, make_receiver
+from wbgs_jax.types import Query, make_query, make_receiver, stack_receivers
 
 TX = np.array([[1.0, 0.5, 1.5], [-1.0, 1.0, 1.2]])
 HZ = np.array([28e9, 5e9])
@@ -196,6 +200,29 @@ def test_blocks_are_computed_when_they_are_asked_for():
 def test_blocks_refuse_positions_that_are_none():
     with pytest.raises(ValueError):
         predict_blocks(Recorder(), np.zeros((4, 3)), np.full(3, 2e9))
+    for several in (predict_blocks, predict_many):
+        with pytest.raises(ValueError, match="block is 0; give at least 1"):
+            several(Recorder(), np.zeros((4, 3)), 2e9, block=0)
+
+
+def test_no_places_have_no_spectra(predict):
+    for none in ([], np.zeros((0, 3))):
+        assert predict_many(predict, none, 28e9).shape == (0, 90, 360)
+        assert list(predict_blocks(predict, none, 28e9)) == []
+
+
+def test_a_receiver_of_the_data_is_known_by_place_array_and_antenna(trained):
+    dataset, lattice = tiny_dataset(), np.mgrid[:1, :4, :4].reshape(3, -1).T
+    own = dataset.receiver()
+    turned = dataclasses.replace(own, orientation=-own.orientation, position=own.position + 5e-4)
+    assert at_receiver(trained, turned, dataset) is trained and receiver_number(dataset, turned) == 0
+    pattern = Pattern(jnp.ones((3, 4, 1)))
+    for change in ({"slant": jnp.asarray(0.5)}, {"pattern": pattern}, {"exponents": own.antenna.exponents + 1e-3}):
+        other = dataclasses.replace(own, antenna=dataclasses.replace(own.antenna, **change))
+        assert receiver_number(dataset, other) is None
+    narrow, wide = (make_receiver(RX, element_positions=lattice * metres, unit="metres") for metres in (1.6e-3, 2.4e-3))
+    of_narrow = dataclasses.replace(dataset, receivers=stack_receivers([narrow]))
+    assert (receiver_number(of_narrow, narrow), receiver_number(of_narrow, wide)) == (0, None)
 
 
 def test_a_map_runs_over_x_then_y_then_frequency():

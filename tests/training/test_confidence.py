@@ -33,7 +33,7 @@ from wbgs_jax.inference.kriging import for_receiver
 from wbgs_jax.inference.predictor import observe_links, predict_spectra
 from wbgs_jax.metrics import ssim
 from wbgs_jax.training.fit_intervals import POWER_SETS, SETS, fit, interval, learn_confidence, left_out, regress, upper_end
-from wbgs_jax.types import Query, make_receiver
+from wbgs_jax.types import Query, make_query, make_receiver
 
 
 def drawn(rng, n_tx, per_tx=5, slope=0.5, noise=0.3):
@@ -287,6 +287,26 @@ def test_blocks_say_what_single_answers_do(rng):
     assert (distance < np.log(0.02)).all()  # at known transmitters
 
 
+def test_each_of_several_receivers_has_intervals_of_its_own(rng):
+    places = np.array([[0.0, 0, 0], [0.5, 0, 1.0]], np.float32)
+    steep = dataclasses.replace(
+        confidence(), weights=confidence().weights.at[-2:].set(jnp.array([0.01, -2.0])), mean=jnp.zeros(SETS[-1])
+    )
+    both = dataclasses.replace(steep, rx_position=jnp.asarray(places))
+    pas, power_db, query = rng.uniform(0, 1, (3, 90, 360)).astype(np.float32), [-70.0] * 3, make_query([[1.0, 2, 1]] * 3, 1e10)
+    with pytest.raises(ValueError, match="for 2 receivers; give the queried one as receiver="):
+        expected_ssim(both, pas, query, power_db)
+    with pytest.raises(ValueError, match="none of the run's receivers"):
+        expected_ssim(both, pas, query, power_db, make_receiver([0.0, 0.0, 0.5]))
+    found = [expected_ssim(both, pas, query, power_db, make_receiver(place)) for place in places]
+    for values, place in zip(found, places, strict=True):
+        alone = expected_ssim(dataclasses.replace(steep, rx_position=jnp.asarray(place)), pas, query, power_db)
+        np.testing.assert_array_equal(values, alone)
+    assert not np.array_equal(found[0].ssim, found[1].ssim)
+    with pytest.raises(ValueError, match=r"pas has shape \(90, 360\); expected \(3, 90, 360\)"):
+        expected_ssim(steep, pas[0], query)
+
+
 def test_expected_scores_lie_between_nothing_and_everything(rng):
     """A transmitter near the receiver or far away has features that no validation transmitter had."""
     pas, f = jnp.asarray(rng.uniform(0, 1, (3, 90, 360)), jnp.float32), jnp.full(3, 1e10)
@@ -357,6 +377,10 @@ def test_expected_errors_of_powers_follow_their_formula(rng):
     error = 2.1 * np.exp([0.0, 1.0])
     np.testing.assert_allclose(found.error_db, 1.5 * error - POWER_MARGIN_DB, rtol=1e-3)
     np.testing.assert_allclose(found.within_db, np.e * error - POWER_MARGIN_DB, rtol=1e-3)
+    listed = expected_power(learned, [friis, friis - 2], query, [0.0, 0.0, 0.0])
+    np.testing.assert_allclose(listed.within_db, found.within_db)
+    with pytest.raises(ValueError, match=r"power_db has shape \(1,\); expected \(2,\)"):
+        expected_power(learned, [friis], query, [0.0, 0.0, 0.0])
     everyone = expected_power(learned, jnp.full(2, friis), query, jnp.asarray([[0.0, 0, 0], [0.5, 0, 0]]))
     assert everyone.within_db[0] != everyone.within_db[1]  # receivers of their own
 

@@ -8,6 +8,8 @@ import pytest
 
 import wbgs_jax as wb
 from wbgs_jax.fields.coherent_model import WavePlan
+from wbgs_jax.fields.networks import positional_encoding
+from wbgs_jax.types import stack_receivers
 
 CONFIG = wb.wideband.WidebandConfig(width=8, depth=2)
 LIMITS = wb.splat.TileLimits(entries=4096, jobs=1024)
@@ -109,3 +111,56 @@ def test_wrong_attenuation_is_refused(planned):
 def test_make_query_broadcasts_one_frequency():
     query = wb.make_query([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], 28e9)
     assert query.tx_position.shape == (2, 3) and query.frequency_hz.tolist() == pytest.approx([28e9] * 2)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"unit": "m"}, "unit is 'm'; give one of: wavelengths, metres"),
+        ({"position": [[0.0, 0.0, 0.0]]}, r"receiver.position has shape \(1, 3\); expected \(3,\)"),
+        ({"element_positions": [0.0, 0.0, 0.0]}, r"receiver.element_positions has shape \(3,\)"),
+        ({"orientation": [0.0, 0.0, 0.0, 0.0]}, "receiver.orientation has zero length"),
+        ({"orientation": [0.0, 0.0, 1.0]}, r"receiver.orientation has shape \(3,\)"),
+    ],
+)
+def test_no_receiver_is_made_of_wrong_values(given, message):
+    with pytest.raises(ValueError, match=message):
+        wb.make_receiver(**({"position": [0.0, 0.0, 0.0]} | given))
+
+
+def test_only_receivers_of_one_kind_are_stacked():
+    wavelengths, metres = (wb.make_receiver([0.0, 0.0, 0.0], unit=unit) for unit in ("wavelengths", "metres"))
+    with pytest.raises(ValueError, match="receivers is empty"):
+        stack_receivers([])
+    for other in (metres, wb.make_receiver([0.0, 0.0, 0.0], element_positions=np.zeros((1, 3)))):
+        with pytest.raises(ValueError, match="receivers differ in the unit"):
+            stack_receivers([wavelengths, other])
+
+
+def test_nothing_to_be_splatted_is_refused():
+    none = wb.splat.Gaussians(jnp.zeros((0, 3)), jnp.zeros((0, 3)), jnp.zeros((0, 4)), jnp.zeros(0))
+    for limits in (None, LIMITS):
+        with pytest.raises(ValueError, match="there are no Gaussians"):
+            wb.splat.geometry_plan(none, wb.make_receiver([0.0, 0.0, 0.0]), limits)
+    with pytest.raises(ValueError, match="limits of 0 entries and 0 jobs"):
+        wb.splat.TileLimits(0, 0)
+
+
+def test_the_dense_reference_takes_numpy_arrays_of_fitting_shapes(rng):
+    receiver = wb.make_receiver([0.0, 0.0, 0.0])
+    gaussians = wb.splat.Gaussians(jnp.ones((2, 3)), jnp.full((2, 3), -2.0), jnp.ones((2, 4)), jnp.zeros(2))
+    splats, attenuation = wb.splat.project(gaussians, receiver), np.full((2, 1), 0.5, np.float32)
+    image = wb.splat.render_dense(splats, attenuation, attenuation)
+    np.testing.assert_array_equal(image, wb.splat.render_dense(splats, *2 * [jnp.asarray(attenuation)]))
+    with pytest.raises(ValueError, match=r"attenuation has shape \(3, 1\); expected \(2, b\)"):
+        wb.splat.render_dense(splats, np.ones((3, 1), np.float32), attenuation)
+
+
+def test_encodings_take_lists():
+    np.testing.assert_array_equal(wb.fields.positional_encoding([0.0, 0, 1], 4), positional_encoding(jnp.array([0.0, 0, 1]), 4))
+    assert wb.fields.frequency_encoding([1e9, 2e9], 2).shape == (2, 5)
+
+
+def test_a_receiver_made_of_lists_is_refused():
+    with pytest.raises(TypeError, match=r"receiver\.position is a list; pass an array"):
+        wb.at_receiver(None, wb.Receiver([0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0], [[0.0, 0.0, 0.0]], [0.0, 0.0]))

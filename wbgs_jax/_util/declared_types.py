@@ -16,7 +16,7 @@ def plain(value: Any) -> Any:
 
 def misfits(cls: type, values: Mapping[str, Any]) -> dict[str, str]:
     """Returns the names of values that do not have the types that a dataclass declares for them, with what is expected, in
-    words. Fields that are dataclasses or of any type are not checked, nor names that are not declared; numbers must be finite."""
+    words. Names that are not declared, dataclasses, and fields of any type are not checked; numbers must be finite."""
     hints = typing.get_type_hints(cls)
     return {name: in_words(hints[name]) for name, value in values.items() if name in hints and not fits(value, hints[name])}
 

@@ -3,6 +3,7 @@ visibility of transmitters from receivers; and closed bodies, in which no antenn
 """
 
 from dataclasses import dataclass
+from typing import get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +21,8 @@ ON, MOST_COMPARED = 1e-3, 1_000_000_000
 """Metres within which a point lies on a surface, and pairs of a point and a triangle that are compared at most (seconds)."""
 MESH_SIZED = (20_000, 70_000)
 """Bounds on the number of points if it is derived from the mesh."""
+FEWEST = 4
+"""Points of a surface: each needs 3 others for its spacing."""
 
 
 @dataclass(frozen=True)
@@ -61,25 +64,32 @@ def make_surface(dataset: Dataset, count: int, seed: int, sampling: SurfaceSampl
 
     "solid_angle" distributes them uniformly over the directions of the receivers' hemispheres, including hidden surfaces: the
     resolution is the same everywhere in the image, and no Gaussian is placed where the image cannot show it. "area" distributes
-    them uniformly over the surface. Without faces, points of the cloud are used; without any points, random ones in the box of
-    transmitters and receivers.
+    them uniformly over the surface. Without faces, points of the cloud are used; with fewer than 4, random ones in the
+    box of transmitters and receivers.
 
     Args:
         dataset: data with a mesh, points, or neither.
-        count: number of points.
+        count: number of points, 0 or at least 4.
         seed: of the random numbers.
         sampling: "solid_angle" or "area".
 
     Returns:
         Points (n, 3) and their spacing (n,), metres, float32.
+
+    Raises:
+        ValueError: the count or the sampling is another one.
     """
+    if count and count < FEWEST:
+        raise ValueError(f"count is {count}; give at least {FEWEST}, or 0 for the size of the mesh")
+    if sampling not in get_args(SurfaceSampling):
+        raise ValueError(f"sampling is {sampling!r}; give one of: {', '.join(get_args(SurfaceSampling))}")
     rng = np.random.default_rng(seed)
     if count == 0:
         count = int(np.clip(len(dataset.vertices), *MESH_SIZED))
     box_margin = 1.0  # margin (metres) around transmitters and receivers in which points are drawn if there are no surfaces
     if len(dataset.faces):
         points = _sample_mesh(dataset, count, rng, sampling)
-    elif len(dataset.vertices):
+    elif len(dataset.vertices) >= FEWEST:
         points = dataset.vertices[rng.choice(len(dataset.vertices), min(count, len(dataset.vertices)), replace=False)]
     else:
         places = _antennas(dataset)
@@ -115,15 +125,20 @@ def make_mesh(dataset: Dataset) -> Mesh:
 
 
 def surface_from_points(points: Float[np.ndarray, "n 3"]) -> Surface:
-    """Returns a surface (float32) with the spacing of its points; at least 4 points are needed.
+    """Returns a surface (float32) with the spacing of its points.
 
     Args:
-        points: (n, 3), world frame, metres.
+        points: (n, 3), at least 4, world frame, metres.
 
     Returns:
-        The points with the mean distance of each to its 3 nearest others, metres.
+        The points (n, 3) with the mean distance (n,) of each to its 3 nearest others, metres.
+
+    Raises:
+        ValueError: there are fewer than 4 points, or their shape is wrong.
     """
-    neighbours, _ = cKDTree(points).query(points, 4)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < FEWEST:
+        raise ValueError(f"points has shape {points.shape}; expected (n, 3) with n at least {FEWEST}")
+    neighbours, _ = cKDTree(points).query(points, FEWEST)
     return Surface(jnp.asarray(points, jnp.float32), jnp.asarray(neighbours[:, 1:].mean(1), jnp.float32))
 
 

@@ -199,12 +199,12 @@ FrequencyScale = Literal["log", "ghz"]
 """Scale of the frequency as an input: "log" maps the band of the paper to -1..1 and extrapolates smoothly, "ghz" is linear."""
 
 
-def positional_encoding(x: Float[Array, "*n d"], octaves: int) -> Float[Array, "*n d_out"]:
+def positional_encoding(x: Any, octaves: int) -> Float[Array, "*n d_out"]:
     """Returns (x, sin(2^k x), cos(2^k x), k = 0..octaves-1), which includes the input: d_out = d (1 + 2 octaves)  (NeRF,
     equation 4).
 
     Args:
-        x: coordinates of order 1.
+        x: coordinates (*n, d) of order 1.
         octaves: number of doublings of the frequency.
 
     Returns:
@@ -215,6 +215,7 @@ def positional_encoding(x: Float[Array, "*n d"], octaves: int) -> Float[Array, "
         >>> positional_encoding(jnp.zeros(3), 6).shape
         (39,)
     """
+    x = jnp.asarray(x)
     scaled = x[..., None, :] * (2.0 ** jnp.arange(octaves, dtype=x.dtype))[:, None]
     waves = jnp.concatenate([jnp.sin(scaled), jnp.cos(scaled)], -2)
     return jnp.concatenate([x, waves.reshape((*x.shape[:-1], -1))], -1)
@@ -229,18 +230,18 @@ def scale_frequency(frequency_hz: Float[Array, "*n"], scale: FrequencyScale = "l
     return (jnp.log(frequency_hz) - middle) / half
 
 
-def frequency_encoding(frequency_hz: Float[Array, "*n"], octaves: int, scale: FrequencyScale = "log") -> Float[Array, "*n d"]:
+def frequency_encoding(frequency_hz: Any, octaves: int, scale: FrequencyScale = "log") -> Float[Array, "*n d"]:
     """Returns the positional encoding of the scaled frequency: d = 1 + 2 octaves.
 
     Args:
-        frequency_hz: of the carriers.
+        frequency_hz: of the carriers (*n).
         octaves: number of doublings of the frequency of the encoding.
         scale: "log" or "ghz" (`scale_frequency`).
 
     Returns:
         The encoding (*n, 1 + 2 octaves).
     """
-    return positional_encoding(scale_frequency(frequency_hz, scale)[..., None], octaves)
+    return positional_encoding(scale_frequency(jnp.asarray(frequency_hz), scale)[..., None], octaves)
 
 
 def legendre(x: Float[Array, "*n"], degree: int) -> Float[Array, "*n d"]:

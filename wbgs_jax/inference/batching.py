@@ -28,9 +28,11 @@ def predict_blocks(
         Arrays (k, 90, 360) or (k,), at most `block` queries per device in each.
 
     Raises:
-        ValueError: the shapes of positions and frequencies do not match.
+        ValueError: the shapes of positions and frequencies do not match, or `block` is less than 1.
     """
-    positions = np.atleast_2d(np.asarray(tx_positions, np.float32))
+    if block < 1:
+        raise ValueError(f"block is {block}; give at least 1 query per device")
+    positions = _positions(tx_positions)
     frequencies = np.broadcast_to(np.asarray(frequencies_hz, np.float32), len(positions))
     n, block = len(positions), block * own_devices().count
 
@@ -51,14 +53,23 @@ def predict_many(
 
     Returns:
         Spectra (n, 90, 360), or powers (n,) in dB, float32.
+
+    Raises:
+        ValueError: as in `predict_blocks`.
     """
-    n, done = len(np.atleast_2d(tx_positions)), 0
+    n, done = len(_positions(tx_positions)), 0
     answers = None
     for part in predict_blocks(predict, tx_positions, frequencies_hz, block):
         answers = np.empty((n, *part.shape[1:]), np.float32) if answers is None else answers
         answers[done : done + len(part)] = part
         done += len(part)
     return np.asarray(predict(np.zeros((0, 3), np.float32), np.zeros(0, np.float32))) if answers is None else answers
+
+
+def _positions(tx_positions: Any) -> Float[np.ndarray, "n d"]:
+    """Returns positions, of which there may be one or none."""
+    positions = np.asarray(tx_positions, np.float32)
+    return np.atleast_2d(positions) if positions.size else np.zeros((0, 3), np.float32)
 
 
 def map_queries(

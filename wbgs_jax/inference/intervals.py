@@ -20,13 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from wbgs_jax._util.checks import check_array
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_tree, write_tree
 from wbgs_jax._util.pytree import AnyArray, map_blocks, pytree
-from wbgs_jax.inference.kriging import SAME_FREQUENCY
-from wbgs_jax.radio.array import EXACT
+from wbgs_jax.inference.kriging import SAME_FREQUENCY, for_receiver
+from wbgs_jax.radio.array import EXACT, PAS_SHAPE
 from wbgs_jax.radio.channel import beyond_free_space_db
-from wbgs_jax.types import Query, Transmitter
+from wbgs_jax.types import Query, Receiver, Transmitter
 
 MARGIN = 0.02
 """Keeps the logarithm of a perfect score finite."""
@@ -148,20 +149,41 @@ def _beyond(power_db: Float[Array, " b"], query: Query, rx_position: Float[Array
 
 
 def expected_ssim(
-    confidence: Confidence, pas: Float[Array, "b 90 360"], query: Query, power_db: Float[Array, " b"] | None = None
+    confidence: Confidence,
+    pas: Any,
+    query: Query,
+    power_db: Any = None,
+    receiver: Receiver | None = None,
 ) -> Expected:
     """Returns the expected SSIM of predicted spectra, with intervals; NaN for a transmitter at the receiver, and where measured
     spectra correct the field at other frequencies only.
 
     Args:
-        confidence: the regression, for the queried receiver.
-        pas: the predicted spectra.
+        confidence: the regression.
+        pas: the predicted spectra (b, 90, 360).
         query: the queries.
-        power_db: the received powers predicted by the field; if omitted, the mean of the feature that depends on them is used.
+        power_db: the received powers (b,) predicted by the field; if omitted, the mean of the feature that depends on them is
+            used.
+        receiver: the queried receiver (host); it may be omitted if the regression is for a single one.
 
     Returns:
         Expected SSIM and the two ends of its prediction interval (b,).
+
+    Raises:
+        ValueError: there are several receivers and none is given, it is not one of them, or shapes do not match.
     """
+    count = query.tx_position.shape[0]
+    pas = jnp.asarray(pas)
+    check_array("pas", pas, (count, *PAS_SHAPE))
+    if power_db is not None:
+        power_db = jnp.asarray(power_db, query.tx_position.dtype)
+        check_array("power_db", power_db, (count,))
+    if receiver is not None:
+        confidence = for_receiver(confidence, receiver)
+        if confidence is None:
+            raise ValueError("receiver is not in the run's data, and only those that are have intervals; give one of them")
+    elif confidence.rx_position.ndim > 1 and len(confidence.rx_position) > 1:
+        raise ValueError(f"these intervals are for {len(confidence.rx_position)} receivers; give the queried one as receiver=")
     known = features(pas, query, confidence.rx_position, confidence.tx_position, power_db)
     if power_db is None:
         known = known.at[:, -1].set(confidence.mean[-1])
@@ -175,21 +197,24 @@ def expected_ssim(
     return Expected(*(jnp.where(valid, jnp.clip(1 + MARGIN - jnp.exp(error) * one, 0, 1), jnp.nan) for one in factors))
 
 
-def expected_power(
-    confidence: PowerConfidence, power_db: Float[Array, " b"], query: Query, rx_position: Float[Array, "*#b 3"]
-) -> ExpectedPower:
+def expected_power(confidence: PowerConfidence, power_db: Any, query: Query, rx_position: Any) -> ExpectedPower:
     """Returns the expected errors of received powers (dB) that a field predicts for B queries; NaN for a transmitter at the
     receiver.
 
     Args:
         confidence: the regression.
-        power_db: the predicted powers.
+        power_db: the predicted powers (b,).
         query: the queries.
-        rx_position: position of the receiver, or one per query, world frame, metres.
+        rx_position: position (3,) of the receiver, or one per query (b, 3), world frame, metres.
 
     Returns:
         Expected absolute error and the bound of the prediction interval (b,), dB.
+
+    Raises:
+        ValueError: there is not one power per query.
     """
+    power_db, rx_position = (jnp.asarray(values, query.tx_position.dtype) for values in (power_db, rx_position))
+    check_array("power_db", power_db, (query.tx_position.shape[0],))
     error = _log_error(confidence, power_features(power_db, query, rx_position, confidence.tx_position))
     bounds = (jnp.exp(error) * factor for factor in (confidence.surplus, jnp.exp(confidence.highest)))
     apart = _apart(query, rx_position)

@@ -33,7 +33,7 @@ from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Bool, Float, Int, Num, UInt8
 
 from wbgs_jax._util.files import read_tree, write_tree
-from wbgs_jax._util.pytree import pytree
+from wbgs_jax._util.pytree import AnyArray, pytree
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, snapshot_to_pas, steering_vector
 from wbgs_jax.radio.geometry import to_local
 from wbgs_jax.types import Query, Receiver
@@ -175,11 +175,17 @@ def for_receiver(learned: Any, receiver: Receiver) -> Any:
     near = int(distance.argmin())
     if distance[near] >= SAME_PLACE_M:
         return None
-    if isinstance(learned, Neighbours | Mixture):
-        least_cosine = 1 - 1e-6  # of half the angle between two orientations that count as the same: a sixth of a degree
-        if abs(np.dot(np.asarray(receiver.orientation), np.asarray(learned.rx_orientation))) < least_cosine:
-            return None
+    turned = isinstance(learned, Neighbours | Mixture) and not same_orientation(receiver.orientation, learned.rx_orientation)
+    if turned:
+        return None
     return learned if learned.rx_position.ndim == 1 else dataclasses.replace(learned, rx_position=learned.rx_position[near])
+
+
+def same_orientation(a: Float[AnyArray, "4"], b: Float[AnyArray, "4"]) -> bool:
+    """Returns whether two quaternions (wxyz) of any length are the same rotation, or one of them is unknown (host)."""
+    least_cosine = 1 - 1e-6  # of half the angle between two orientations that count as the same: a sixth of a degree
+    first, second = (np.asarray(one, np.float64) / np.linalg.norm(one) for one in (a, b))
+    return not abs(np.dot(first, second)) < least_cosine
 
 
 def write_neighbours(folder: Path, neighbours: Beside) -> None:

@@ -24,8 +24,8 @@ from wbgs_jax.data.splits import (
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.intervals import Confidence, PowerConfidence
-from wbgs_jax.inference.kriging import SAME_PLACE_M, Beside
-from wbgs_jax.types import Receiver
+from wbgs_jax.inference.kriging import SAME_PLACE_M, Beside, same_orientation
+from wbgs_jax.types import Receiver, check_receiver
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,9 @@ def at_receiver(trained: TrainedField, receiver: Receiver, dataset: Dataset | No
 
     Raises:
         UserError: no part of the field is receiver-independent.
+        TypeError, ValueError: the receiver is not a single one, made of arrays.
     """
+    check_receiver(receiver)
     dataset = trained.dataset() if dataset is None else dataset
     if receiver_number(dataset, receiver) is not None:
         return trained
@@ -165,7 +167,14 @@ def receiver_number(dataset: Dataset, receiver: Receiver) -> int | None:
 
 
 def _same(a: Receiver, b: Receiver) -> bool:
-    if np.vdot(a.orientation, b.orientation) < 0:  # a quaternion and its negative are the same rotation
-        b = dataclasses.replace(b, orientation=-b.orientation)
-    leaves = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
-    return a.unit == b.unit and all(x.shape == y.shape and np.allclose(x, y, atol=SAME_PLACE_M) for x, y in leaves)
+    if jax.tree.structure(a) != jax.tree.structure(b) or jax.tree.map(np.shape, a) != jax.tree.map(np.shape, b):
+        return False
+    elements = np.asarray(a.element_positions)
+    tolerance = 1e-4 * np.linalg.norm(elements - elements[:1], axis=-1).max(initial=0)  # in the unit of the elements
+    antennas = zip(jax.tree.leaves(a.antenna), jax.tree.leaves(b.antenna), strict=True)
+    return (
+        bool(np.linalg.norm(np.subtract(a.position, b.position)) < SAME_PLACE_M)
+        and same_orientation(a.orientation, b.orientation)
+        and np.allclose(elements, b.element_positions, atol=tolerance)
+        and all(np.allclose(x, y, atol=1e-6) for x, y in antennas)
+    )

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from wbgs_jax._util.checks import check_array
-from wbgs_jax._util.pytree import pytree
+from wbgs_jax._util.pytree import AnyArray, pytree
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.radio.geometry import Projection
 from wbgs_jax.splat.composite import composite
@@ -48,6 +48,9 @@ def geometry_plan(
 
     Returns:
         The plan, for `render_splats` with any attenuation and signal.
+
+    Raises:
+        ValueError: there are no Gaussians, or limits are missing under jit.
     """
     splats = project(gaussians, receiver, projection, means2d_offset)
     if limits is None:
@@ -101,7 +104,9 @@ def render_splats(
     return jnp.where(plan.jobs.overflow, jnp.nan, image)
 
 
-def render_dense(splats: Splats, attenuation: Float[Array, "n b"], signal: Float[Array, "n b"]) -> Float[Array, "b 90 360"]:
+def render_dense(
+    splats: Splats, attenuation: Float[AnyArray, "n b"], signal: Float[AnyArray, "n b"]
+) -> Float[Array, "b 90 360"]:
     """Returns N splats blended for B queries; attenuation (delta, in [0, 1)) and signal (Sig) are per Gaussian and query.
 
     The reference: equation 6 of the paper, Gaussian by Gaussian over all pixels. Slow, short, differentiable.
@@ -120,6 +125,9 @@ def render_dense(splats: Splats, attenuation: Float[Array, "n b"], signal: Float
     Returns:
         Images (b, 90, 360), in the unit of the signal.
     """
+    check_array("attenuation", attenuation, (splats.depths.shape[0], "b"))
+    check_array("signal", signal, attenuation.shape)
+    attenuation, signal = jnp.asarray(attenuation), jnp.asarray(signal)
     order = jnp.argsort(jax.lax.stop_gradient(splats.depths))
     x = jnp.arange(PAS_WIDTH, dtype=attenuation.dtype)[None, :]
     y = jnp.arange(PAS_HEIGHT, dtype=attenuation.dtype)[:, None]

@@ -95,6 +95,10 @@ class TileLimits:
     tile_width: int = CPU_TILING.width
     """Pixels."""
 
+    def __post_init__(self) -> None:
+        if self.entries < 1 or self.jobs < 1:
+            raise ValueError(f"limits of {self.entries} entries and {self.jobs} jobs; give at least 1 of each")
+
     @property
     def tiling(self) -> Tiling:
         """Returns the tiles of these limits."""
@@ -161,6 +165,8 @@ class _Boxes:
 def build_tile_jobs(splats: Splats, limits: TileLimits) -> TileJobs:
     """Returns splats sorted into tiles. Works under jit; carries no gradient."""
     n, tiling = splats.depths.shape[0], limits.tiling
+    if not n:
+        raise ValueError("there are no Gaussians to be listed; give at least one")
     most = (2**32 - 2) // tiling.tiles
     if n > most:
         raise ValueError(f"{n} Gaussians are too many for a 32-bit (tile, depth) key; the most is {most}")
