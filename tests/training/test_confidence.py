@@ -289,14 +289,13 @@ def test_blocks_say_what_single_answers_do(rng):
 
 def test_each_of_several_receivers_has_intervals_of_its_own(rng):
     places = np.array([[0.0, 0, 0], [0.5, 0, 1.0]], np.float32)
-    steep = dataclasses.replace(
-        confidence(), weights=confidence().weights.at[-2:].set(jnp.array([0.01, -2.0])), mean=jnp.zeros(SETS[-1])
-    )
+    weights = confidence().weights.at[-2:].set(jnp.array([0.1, -2.0]))
+    steep = dataclasses.replace(confidence(), weights=weights, scale=jnp.full(SETS[-1], 10.0))
     both = dataclasses.replace(steep, rx_position=jnp.asarray(places))
     pas, power_db, query = rng.uniform(0, 1, (3, 90, 360)).astype(np.float32), [-70.0] * 3, make_query([[1.0, 2, 1]] * 3, 1e10)
     with pytest.raises(ValueError, match="for 2 receivers; give the queried one as receiver="):
         expected_ssim(both, pas, query, power_db)
-    with pytest.raises(ValueError, match="none of the run's receivers"):
+    with pytest.raises(ValueError, match="not in the run's data"):
         expected_ssim(both, pas, query, power_db, make_receiver([0.0, 0.0, 0.5]))
     found = [expected_ssim(both, pas, query, power_db, make_receiver(place)) for place in places]
     for values, place in zip(found, places, strict=True):

@@ -167,7 +167,8 @@ def receiver_number(dataset: Dataset, receiver: Receiver) -> int | None:
 
 
 def _same(a: Receiver, b: Receiver) -> bool:
-    if jax.tree.structure(a) != jax.tree.structure(b) or jax.tree.map(np.shape, a) != jax.tree.map(np.shape, b):
+    kind, other = ((jax.tree.structure(one), [np.shape(leaf) for leaf in jax.tree.leaves(one)]) for one in (a, b))
+    if kind != other:
         return False
     elements = np.asarray(a.element_positions)
     tolerance = 1e-4 * np.linalg.norm(elements - elements[:1], axis=-1).max(initial=0)  # in the unit of the elements
