@@ -42,6 +42,45 @@ def test_one_path_and_none():
     assert np.isnan(channel.angular_spread_deg(none)).all()
 
 
+def at_angles(zenith, azimuth):
+    """Unit directions."""
+    zenith, azimuth = np.broadcast_arrays(zenith, azimuth)
+    return jnp.float32(np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], -1))
+
+
+def spreads_of(power, zenith, azimuth):
+    """Azimuth and zenith spread by TR 38.901, annex A, in double precision."""
+    means = [np.abs(power @ np.exp(1j * angle)) / power.sum() for angle in (azimuth, zenith)]
+    return np.degrees(np.sqrt(-2 * np.log(means)))
+
+
+def test_vertical_paths_have_azimuth_zero():
+    """As in the patterns of antennas; one alone has no spread."""
+    for z in (1.0, -1.0):
+        overhead = arrivals([1.0], [3.0])._replace(direction=jnp.array([[0.0, 0.0, z]]))
+        np.testing.assert_allclose(channel.angular_spread_deg(overhead), 0, atol=0.1)
+    amplitude, zenith, azimuth = np.array([1.0, 0.2, 0.1]), np.radians([0.0, 60.0, 80.0]), np.radians([0.0, 20.0, -30.0])
+    found = arrivals(amplitude, [3, 4, 5])._replace(direction=at_angles(zenith, azimuth).at[0].set(jnp.array([0.0, 0.0, 1.0])))
+    np.testing.assert_allclose(channel.angular_spread_deg(found), spreads_of(amplitude**2, zenith, azimuth), rtol=2e-3)
+    slope = jax.grad(lambda direction: channel.angular_spread_deg(found._replace(direction=direction)).sum())(found.direction)
+    assert np.isfinite(slope).all()
+
+
+@pytest.mark.parametrize("gain", [1.0, 1e-15, 1e-17, 1e-20])
+def test_spreads_and_gains_do_not_depend_on_the_scale(rng, gain):
+    """-300 dB is the power that counts as zero, and squares of -380 dB underflow."""
+    amplitude = rng.normal(size=4) + 1j * rng.normal(size=4)
+    zenith, azimuth = rng.uniform(0.8, 1.6, 4), rng.uniform(-1, 1, 4)
+    found = arrivals(gain * amplitude, [3, 4, 5, 6])._replace(direction=at_angles(zenith, azimuth))
+    power = np.abs(amplitude) ** 2
+    np.testing.assert_allclose(channel.angular_spread_deg(found), spreads_of(power, zenith, azimuth), rtol=1e-3)
+    variance = np.cov(np.array([3, 4, 5, 6]) / SPEED_OF_LIGHT, aweights=power, ddof=0)
+    np.testing.assert_allclose(delay_spread_s(found), np.sqrt(variance), rtol=1e-3)
+    y = jnp.complex64(gain * amplitude)
+    expected = 10 * np.log10(np.abs(amplitude.sum()) ** 2 / 4 / power.mean())
+    np.testing.assert_allclose(channel.beamforming_gain_db(y, jnp.abs(y.sum())), expected, atol=1e-3)
+
+
 @pytest.mark.parametrize("function", [channel.k_factor_db, channel.delay_spread_s, channel.angular_spread_deg])
 def test_gradients_of_links_with_a_few_paths_are_finite(function):
     """Also of links with one path, in the same batch."""
@@ -73,6 +112,15 @@ def test_correlation_is_blind_to_phase_and_scale(rng):
     expected = np.abs(np.sum(np.conj(a) * b, -1)) / np.linalg.norm(a, axis=-1) / np.linalg.norm(b, axis=-1)
     np.testing.assert_allclose(correlation(a, b), expected, rtol=1e-4)
     assert (correlation(a, 0 * a) == 0).all()
+
+
+def test_slopes_of_correlation_are_finite_where_it_is_zero():
+    """For a zero snapshot, and for orthogonal ones."""
+    one, other = jnp.array([1.0 + 0j, 1j]), jnp.array([1.0 + 0j, -1j])
+    for a, b in ((0 * one, one), (one, 0 * one), (one, other)):
+        for slope in jax.grad(correlation, (0, 1))(a, b):
+            assert np.isfinite(slope).all()
+    assert float(correlation(one, other)) == 0
 
 
 def test_angles_of_two_paths_spread_by_their_separation():

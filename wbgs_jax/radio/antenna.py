@@ -56,7 +56,7 @@ class Pattern:
 
     def at(self, direction: Float[Array, "*m 3"]) -> Inexact[Array, "*m 3"]:
         """Returns the field of one antenna in unit directions of its own frame."""
-        direction = _off_the_axis(direction)
+        direction = off_the_axis(direction)
         azimuth, zenith = direction_to_angles(direction)
         rows, columns, parts = self.values.shape[0] - 1, self.values.shape[1], self.values.shape[2]
         row, row_weights = _cubic(zenith * (rows / jnp.pi))
@@ -71,7 +71,7 @@ class Pattern:
         return found - jnp.sum(found * direction, -1, keepdims=True) * direction
 
 
-def _off_the_axis(direction: Float[Array, "*m 3"]) -> Float[Array, "*m 3"]:
+def off_the_axis(direction: Float[Array, "*m 3"]) -> Float[Array, "*m 3"]:
     """Returns directions of which none is exactly vertical: there angles have no derivative, and theta-hat is not defined."""
     x, y, z = jnp.moveaxis(direction, -1, 0)
     vertical = x * x + y * y < POLE
@@ -212,6 +212,6 @@ def dipole_gain(direction: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
 def zenith_vector(direction: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     """Returns the unit vector theta-hat of a unit direction: the electric field direction of a vertically polarised antenna. In
     the vertical directions, where the azimuth is undefined, it is that of azimuth 0."""
-    x, y, z = jnp.moveaxis(_off_the_axis(direction), -1, 0)
+    x, y, z = jnp.moveaxis(off_the_axis(direction), -1, 0)
     horizontal = jnp.sqrt(x * x + y * y)
     return jnp.stack([z * x / horizontal, z * y / horizontal, -horizontal], -1)

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
+from wbgs_jax.radio.antenna import off_the_axis
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude, steering_vector, wide_covariance_to_pas
 
 
@@ -192,8 +193,10 @@ def beamforming_gain_db(snapshot: Complex[Array, "*b elements"], peak: Float[Arr
         snapshot: complex voltages of the elements.
         peak: largest |a^H y| over all directions.
     """
-    mean = jnp.mean(squared_magnitude(snapshot), -1)
-    return decibels(peak**2 / snapshot.shape[-1] / jnp.maximum(mean, SMALLEST))
+    strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(snapshot), -1))
+    strongest = jnp.where(strongest > 0, strongest, 1)
+    mean = jnp.mean(squared_magnitude(snapshot / strongest[..., None]), -1)  # relative: no underflow
+    return decibels((peak / strongest) ** 2 / snapshot.shape[-1] / jnp.maximum(mean, SMALLEST))
 
 
 def k_factor_db(arrivals: Paths) -> Float[Array, "*b"]:
@@ -222,14 +225,11 @@ def delay_spread_s(arrivals: Paths) -> Float[Array, "*b"]:
     Returns:
         Seconds (*b,); 0 with a single path, NaN without any.
     """
-    power = squared_magnitude(arrivals.amplitude)
-    total = jnp.sum(power, -1, keepdims=True)
-    weight = power / jnp.maximum(total, SMALLEST)
+    weight, received = _shares(arrivals.amplitude)
     delay = arrivals.length / SPEED_OF_LIGHT
     mean = jnp.sum(weight * delay, -1, keepdims=True)
     variance = jnp.sum(weight * (delay - mean) ** 2, -1)
-    spread = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1)), 0)  # the root has no slope at 0
-    return jnp.where(total[..., 0] > 0, spread, jnp.nan)
+    return jnp.where(received, _root(variance), jnp.nan)
 
 
 def angular_spread_deg(arrivals: Paths) -> Float[Array, "*b 2"]:
@@ -242,16 +242,27 @@ def angular_spread_deg(arrivals: Paths) -> Float[Array, "*b 2"]:
     Returns:
         Azimuth and zenith spread (*b, 2), degrees; NaN without any path.
     """
-    power = squared_magnitude(arrivals.amplitude)
-    total = jnp.sum(power, -1, keepdims=True)
-    weight = power / jnp.maximum(total, SMALLEST)
-    x, y, z = jnp.moveaxis(arrivals.direction, -1, 0)
-    level = jnp.sqrt(jnp.maximum(x * x + y * y, SMALLEST))
+    weight, received = _shares(arrivals.amplitude)
+    x, y, z = jnp.moveaxis(off_the_axis(arrivals.direction), -1, 0)
+    level = jnp.sqrt(x * x + y * y)
     unit = jnp.stack([jnp.stack([x / level, y / level], -1), jnp.stack([z, level], -1)], -3)  # (*b, 2, k, 2)
     mean = jnp.sum(weight[..., None, :, None] * unit, -2)
     length = jnp.maximum(jnp.sum(mean**2, -1), SMALLEST)
-    spread = jnp.where(length < 1, jnp.degrees(jnp.sqrt(-jnp.log(jnp.where(length < 1, length, 0.5)))), 0)  # as above
-    return jnp.where(total > 0, spread, jnp.nan)
+    spread = jnp.where(length < 1, jnp.degrees(jnp.sqrt(-jnp.log(jnp.where(length < 1, length, 0.5)))), 0)
+    return jnp.where(received[..., None], spread, jnp.nan)
+
+
+def _shares(amplitude: Any) -> tuple[Float[Array, "*b k"], Bool[Array, "*b"]]:
+    """Returns the shares of paths in the power of their link, which add up to 1, and whether there are any paths."""
+    strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(jnp.asarray(amplitude)), -1, keepdims=True))
+    power = squared_magnitude(amplitude / jnp.where(strongest > 0, strongest, 1))  # those of faint amplitudes would underflow
+    total = jnp.sum(power, -1, keepdims=True)
+    return power / jnp.where(total > 0, total, 1), total[..., 0] > 0
+
+
+def _root(power: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """Returns the square root, with gradient 0 at 0."""
+    return jnp.where(power > 0, jnp.sqrt(jnp.where(power > 0, power, 1)), 0)
 
 
 def doppler_hz(
@@ -278,7 +289,7 @@ def unit_snapshots(
     snapshots: Complex[Array, "*b elements"],
 ) -> tuple[Complex[Array, "*b elements"], Float[Array, "*b 1"]]:
     """Returns snapshots scaled to norm 1 (zero snapshots stay zero) and their norms."""
-    norm = jnp.sqrt(jnp.sum(squared_magnitude(snapshots), -1, keepdims=True))
+    norm = _root(jnp.sum(squared_magnitude(snapshots), -1, keepdims=True))
     return snapshots / jnp.where(norm > 0, norm, 1), norm
 
 
@@ -293,7 +304,7 @@ def correlation(a: Any, b: Any) -> Float[Array, "*b"]:
     """
     # Computed from unit vectors: the squared product of weak snapshots would underflow in single precision.
     (unit_a, _), (unit_b, _) = (unit_snapshots(jnp.asarray(one)) for one in (a, b))
-    return jnp.sqrt(squared_magnitude(jnp.sum(unit_a.conj() * unit_b, -1)))
+    return _root(squared_magnitude(jnp.sum(unit_a.conj() * unit_b, -1)))
 
 
 def added_powers(arrivals: Paths, elements: Float[Array, "elements 3"]) -> Float[Array, "90 360"]:
