@@ -11,12 +11,13 @@ from builders.wave_runs import PARTS, RX, places, run_in
 
 from wbgs_jax._util.files import write_csv
 from wbgs_jax.data.tables import read_table
-from wbgs_jax.inference.evaluate_quantities import LoadedField, mimo_matrices
+from wbgs_jax.inference.evaluate_quantities import LoadedField, mimo_matrices, predict_gains, predict_paths
 from wbgs_jax.inference.path_table import SIGHT
 from wbgs_jax.inference.predictor import observe_queries
 from wbgs_jax.inference.quantities import Options
 from wbgs_jax.inference.results_file import Answers, table_rows
-from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array, steering_vector
+from wbgs_jax.interchange.sionna_arrays import cir_of_paths
+from wbgs_jax.radio.array import SPEED_OF_LIGHT, pas_directions, planar_array, steering_vector
 from wbgs_jax.types import make_query
 
 SETTINGS = tiny_settings(
@@ -165,6 +166,26 @@ def test_a_matrix_is_what_elements_elsewhere_would_send(asked):
         truth = snapshot(asked, TX + place * SPEED_OF_LIGHT / GHZ[0])[0]
         np.testing.assert_allclose(column, truth, atol=0.01 * np.abs(truth).max())
     assert np.linalg.norm(found - found[:, :1]) > 0.01 * np.linalg.norm(found)
+
+
+def test_an_array_out_of_tune_is_so_in_every_quantity(asked, rng):
+    """A matrix of one transmit element and the sum of an impulse response are the snapshot; the gain is of its best beam."""
+    gains = np.exp(rng.normal(0, 0.2, 16) + 1j * rng.normal(0, 0.5, 16))
+    field = asked.trained.field.with_gains(gains[None])
+    own = dataclasses.replace(asked, trained=dataclasses.replace(asked.trained, field=field))
+    expected = snapshot(own)[0]
+    near = {"rtol": 1e-3, "atol": 1e-3 * np.abs(expected).max()}
+    np.testing.assert_allclose(expected, gains * snapshot(asked)[0], **near)
+    np.testing.assert_allclose(mimo_matrices(own, TX, GHZ, np.zeros((1, 3)))[0, 0, :, 0], expected, **near)
+    found = predict_gains(own.trained, own.receiver)
+    np.testing.assert_allclose(found, gains, rtol=1e-5)
+    a, _ = cir_of_paths(predict_paths(own.trained, own.receiver, TX, GHZ[0]), own.receiver, GHZ[0], found)
+    np.testing.assert_allclose(a[0, 0, :, 0, 0, :, 0].sum(-1), expected, **near)
+    elements = jnp.asarray(own.receiver.element_positions)
+    strongest = np.abs(np.asarray(steering_vector(elements, jnp.float32(pas_directions()))).conj() @ expected).max()
+    best = 10 * np.log10(strongest**2 / 16 / np.mean(np.abs(expected) ** 2))
+    np.testing.assert_allclose(own.evaluate("beamforming-gain", TX, GHZ)["beamforming_gain_db"][0, 0], best, atol=0.01)
+    assert (predict_gains(asked.trained, asked.receiver) == 1).all()
 
 
 def test_a_table_becomes_a_file(asked, tmp_path):

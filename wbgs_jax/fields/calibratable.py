@@ -6,12 +6,13 @@ array gains) or its parameters (`WaveParams`); both are returned as new objects.
 """
 
 from abc import abstractmethod
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Key
 
 from wbgs_jax.fields.base import Field, MaterialProperties, Params
-from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams, WavePlan
+from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams, WavePlan, element_gains
 from wbgs_jax.fields.coherent_settings import WaveConfig
 from wbgs_jax.mesh.facets import AnyArray, Facets
 from wbgs_jax.propagation.displacement import Motion
@@ -117,6 +118,13 @@ class Calibratable(Field):
     @abstractmethod
     def penalty(self, params: WaveParams) -> Float[Array, ""]:
         """Returns the regularisation of its loss, which depends on the parameters only."""
+
+
+def gains_in(field: Field, plan: Any) -> Complex[Array, " elements"] | float:
+    """Returns the complex gains of a receiver's calibrated elements from a field's plan; 1 for ideal elements."""
+    own = field.ability(Calibratable)
+    stored = None if own is None else own.of(plan).array_gains
+    return 1.0 if stored is None else element_gains(stored)
 
 
 def at_isotropic_antennas(field: Field, params: Params) -> tuple[Field, Params]:

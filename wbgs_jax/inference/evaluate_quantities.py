@@ -19,6 +19,7 @@ from wbgs_jax.data.scene import DatasetScene, closed_bodies
 from wbgs_jax.data.splits import without_test
 from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.fields.base import Params, outputs_of, paths_of
+from wbgs_jax.fields.calibratable import gains_in
 from wbgs_jax.inference.domain import Domain
 from wbgs_jax.inference.intervals import expect_many, expected_power
 from wbgs_jax.inference.kriging import for_receiver
@@ -37,8 +38,8 @@ from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MIN_FREQUENCY_HZ, Query, Receiver
 Answer = dict[str, np.ndarray]
 """Arrays by name, with leading axes (tx, freq), or the columns of a table."""
 DEFAULTS = Options()
-OfPaths = Callable[[Paths, Receiver, Any], Array]
-"""(paths of one link, receiver, frequency_hz) -> a quantity of the link."""
+OfPaths = Callable[[Paths, Receiver, Any, Any], Array]
+"""(paths of one link, receiver, frequency_hz, gains of its elements) -> a quantity of the link."""
 
 
 @dataclass(frozen=True)
@@ -218,12 +219,12 @@ def _from_arrivals(
 
 @partial(jax.jit, static_argnames=("function",))
 def _measure(field: Field, params: Params, plan: Any, receiver: Receiver, query: Query, function: OfPaths) -> Any:
-    arrivals = paths_of(field, params, plan, query)
-    return jax.vmap(lambda one, frequency_hz: function(one, receiver, frequency_hz))(arrivals, query.frequency_hz)
+    arrivals, gains = paths_of(field, params, plan, query), gains_in(field, plan)
+    return jax.vmap(lambda one, hertz: function(one, receiver, hertz, gains))(arrivals, query.frequency_hz)
 
 
-def _beamforming_gain(arrivals: Paths, receiver: Receiver, frequency_hz: Any) -> Array:
-    y = snapshots_from_paths(arrivals, receiver, frequency_hz)
+def _beamforming_gain(arrivals: Paths, receiver: Receiver, frequency_hz: Any, gains: Any) -> Array:
+    y = snapshots_from_paths(arrivals, receiver, frequency_hz) * gains
     directions = jnp.asarray(pas_directions(), jnp.float32)
     strongest = jnp.max(cbf(y, steering_vector(receiver.element_wavelengths(frequency_hz), directions)))
     return jnp.where(strongest > 0, channel.beamforming_gain_db(y, strongest), jnp.nan)  # NaN without any path
@@ -291,8 +292,8 @@ def mimo_matrices(
 
 @jax.jit
 def _matrices(field: Field, params: Params, plan: Any, query: Query, receiver: Receiver, elements: Any) -> Any:
-    arrivals = paths_of(field, params, plan, query)
-    return jax.vmap(lambda one, hertz: mimo_matrix(one, receiver, hertz, elements))(arrivals, query.frequency_hz)
+    arrivals, gains = paths_of(field, params, plan, query), jnp.reshape(gains_in(field, plan), (-1, 1))
+    return jax.vmap(lambda one, hertz: gains * mimo_matrix(one, receiver, hertz, elements))(arrivals, query.frequency_hz)
 
 
 EVALUATE: dict[str, Callable[[LoadedField, np.ndarray, np.ndarray], Answer]] = {
@@ -337,3 +338,20 @@ def predict_paths(
     query = make_query(np.asarray(tx_positions), np.full(len(tx_positions), frequency_hz))
     found: Paths = map_blocks(lambda block: paths_of(trained.field, trained.params, plan, block), query, BLOCK)
     return found
+
+
+def predict_gains(trained: TrainedField, receiver: Receiver) -> Complex[Array, " elements"]:
+    """Returns the complex gains of a receiver's elements relative to ideal ones, which the calibration has estimated.
+
+    Args:
+        trained: the field, whose `predict_paths` are those to ideal elements.
+        receiver: a receiver of the training data; the elements of any other one are ideal.
+
+    Returns:
+        Gains (elements,); 1 for ideal elements.
+
+    Example:
+        >>> gains = predict_gains(trained, trained.dataset().receiver())  # doctest: +SKIP
+    """
+    gains = gains_in(trained.field, trained.field.plan(trained.params, receiver))
+    return jnp.broadcast_to(jnp.asarray(gains, jnp.complex64), len(receiver.element_positions))

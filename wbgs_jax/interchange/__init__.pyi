@@ -1,3 +1,4 @@
+from ..inference.evaluate_quantities import predict_gains as predict_gains
 from .deepmimo import as_deepmimo as as_deepmimo
 from .deepmimo import from_deepmimo as from_deepmimo
 from .deepmimo import load_deepmimo as load_deepmimo

@@ -54,7 +54,7 @@ class _Device(NamedTuple):
 
 @jax.jit
 def cir_of_paths(
-    paths: Paths, receiver: Receiver, frequency_hz: Float[Array, ""] | float
+    paths: Paths, receiver: Receiver, frequency_hz: Float[Array, ""] | float, gains: Any = 1.0
 ) -> tuple[Complex[Array, "b 1 elements 1 1 k 1"], Float[Array, "b 1 1 k"]]:
     """Returns impulse responses as Sionna PHY's channel models and its `CIRDataset` have them, for one receiver with all of its
     elements, one transmitter with one antenna, and one instant.
@@ -66,6 +66,7 @@ def cir_of_paths(
         paths: of B links at one receiver and one frequency (`predict_paths`).
         receiver: the receiver.
         frequency_hz: of the carrier.
+        gains: (elements,), complex gains of the receiver's elements (`predict_gains`); by default they are ideal.
 
     Returns:
         Coefficients `a` (B, 1, elements, 1, 1, k, 1), and 0 for padding; delays `tau` (B, 1, 1, k), seconds, and 0 for padding.
@@ -76,6 +77,7 @@ def cir_of_paths(
     hertz = jnp.asarray(frequency_hz, jnp.float32)
     voltages = jax.vmap(lambda one: element_voltages(one, receiver, hertz))(jax.tree.map(jnp.asarray, paths))
     _, delays = paths.cir()
+    voltages = voltages * gains
     return voltages.swapaxes(1, 2)[:, None, :, None, None, :, None], jnp.maximum(delays, 0)[:, None, None]
 
 
