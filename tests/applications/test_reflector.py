@@ -42,6 +42,23 @@ def test_a_small_plate_obeys_the_radar_equation():
     assert float(plate.power_db(FACING)[0, 0]) == pytest.approx(expected, abs=0.1)
 
 
+@pytest.mark.parametrize("degrees", [0, 45, 60, 75])
+@pytest.mark.parametrize("turn", [0, 30, 45, 90])
+def test_of_slanted_waves_a_small_plate_reflects_its_projected_area(degrees, turn):
+    """Relative to a large plate in its place, A cos(theta) / (wavelength times the focal length); whichever way it is slanted,
+    and of whichever shape."""
+    legs, theta, phi = np.array([3.0, 2.0]), np.radians(degrees), np.radians(turn)
+    normal, level, up = (np.asarray(axis) for axis in plate_axes(jnp.zeros(2)))
+    aside = np.sin(theta) * (np.cos(phi) * level + np.sin(phi) * up)
+    tx, user = legs[0] * (np.cos(theta) * normal + aside), legs[1] * (np.cos(theta) * normal - aside)
+    expected = 20 * np.log10(0.02 * 0.015 * np.cos(theta) / WAVELENGTH / (legs.prod() / legs.sum()))
+    small, turned, large = (
+        float(make_reflector(tx, user, size, HZ).power_db(jnp.zeros((1, 5)))[0, 0])
+        for size in ((0.02, 0.015), (0.015, 0.02), (40.0, 40.0))
+    )
+    assert small - large == pytest.approx(expected, abs=0.1) == turned - large
+
+
 def test_at_the_edge_of_a_plate_half_of_the_amplitude_is_left_and_behind_it_nothing():
     plate = make_reflector(TX, USER, (2.0, 4.0), HZ)
     over = plate.power_db(jnp.concatenate([FACING, FACING.at[:, 0].add(1.0), FACING.at[:, 0].add(2.0)]))[:, 0]

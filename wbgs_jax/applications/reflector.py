@@ -106,9 +106,12 @@ class Reflector:
         point = image + share * (there - image)
         first, second, whole = _length(point - here), _length(there - point), _length(there - image)
         arriving = (point - here) / first
+        # Squared cosines of tilt in the planes of the two axes; their Fresnel zones are those of an area seen at the cosine.
+        wide, high = (jnp.maximum(1 - _along(arriving, axis) ** 2, NEAREST_M) for axis in (level, up))
+        cosine, focal = jnp.abs(_along(arriving, normal)), first * second / whole
         caught = [
-            _caught(_along(point, axis), half, _along(arriving, axis), first * second / whole, self.frequencies_hz, blur)
-            for axis, half in ((level, self.size[0] / 2), (up, self.size[1] / 2))
+            _caught(_along(point, axis), half, cosine * jnp.sqrt(ratio), focal, self.frequencies_hz, blur)
+            for axis, half, ratio in ((level, self.size[0] / 2, wide / high), (up, self.size[1] / 2, high / wide))
         ]
         leaving = (there - point) / second
         field = zenith_vector(arriving)
@@ -246,7 +249,7 @@ def plate_axes(angles: Float[Array, "2"]) -> tuple[Float[Array, "3"], Float[Arra
 
 
 def _caught(
-    aside: Array, half: Array, slant: Array, focal: Array, frequencies_hz: Float[Array, " f"], blur: Array
+    aside: Array, half: Array, tilt: Array, focal: Array, frequencies_hz: Float[Array, " f"], blur: Array
 ) -> Float[Array, " f"]:
     """Returns the fraction of the wave's amplitude that a plate reflects, along one axis: 1 if it extends over many Fresnel
     zones on both sides, 1/2 at its edge.
@@ -257,12 +260,12 @@ def _caught(
     Args:
         aside: distance along the axis from the plate's centre to the point of reflection, metres.
         half: half the side, metres.
-        slant: cosine between the axis and the wave's direction.
+        tilt: curvature of the wave's phase along the axis, relative to that at normal incidence.
         focal: product of both path lengths over their sum, metres.
         frequencies_hz: hertz.
         blur: smoothing length, metres.
     """
-    zone = SPEED_OF_LIGHT / frequencies_hz * focal / jnp.maximum(1 - slant**2, NEAREST_M)
+    zone = SPEED_OF_LIGHT / frequencies_hz * focal / jnp.maximum(tilt, NEAREST_M)
     width = jnp.sqrt(zone / jnp.pi + blur**2)
     return (jax.scipy.special.erf((half - aside) / width) + jax.scipy.special.erf((half + aside) / width)) / 2
 
