@@ -151,6 +151,33 @@ def test_an_observation_of_another_shape_and_a_field_that_knows_too_little_are_r
         make_locator(trained_field(Silent(), None), HZ, "snapshots")
 
 
+def test_too_few_received_powers_are_no_match(by_power, rng):
+    """Of which a transmitter of unknown power needs two."""
+    unknown = make_locator(trained(), HZ[:1], "power", RECEIVERS, BOX, known_power=False)
+    place = jnp.asarray(somewhere(rng, 1))
+    for asked, observed in (
+        (by_power, [np.nan] * 4),
+        (by_power, [-300.0] * 4),
+        (unknown, [-300.0, np.nan, -60.0, -300.0]),
+    ):
+        observed = jnp.array(observed)
+        with pytest.raises(ValueError, match=r"at least [12] are needed"):
+            asked(observed[:, None])
+        with pytest.raises(ValueError, match=r"at least [12] are needed"):
+            asked.loss(place, observed, 0.0)
+    assert np.isfinite(by_power.loss(place, jnp.array([-60.0, *[np.nan] * 3]), 0.0)).all()
+
+
+def test_losses_take_powers_of_receivers_and_frequencies(rng):
+    asked = make_locator(trained(), HZ, "power", RECEIVERS[:2], BOX, step=2.0)
+    place, aside = somewhere(rng, 2)
+    observed = said(asked, place, "power_db")
+    both = jnp.asarray(np.stack([place, aside]))
+    losses = asked.loss(both, observed, 0.0)
+    np.testing.assert_array_equal(losses, asked.loss(both, observed.reshape(-1), 0.0))
+    np.testing.assert_allclose(losses[0], 0, atol=1e-6)
+
+
 class Silent(MirrorsField):
     """Spectra alone."""
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from wbgs_jax._util.checks import concrete
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.applications.multistart import best_apart, gauss_newton, grid_over, in_blocks, shrinking
@@ -88,7 +89,7 @@ class Locator:
         """Returns the estimated position of the transmitter of an observation.
 
         Raises:
-            ValueError: the observation does not have the shape given by receivers and frequencies.
+            ValueError: the observation does not have the shape given by receivers and frequencies, or has too few powers.
         """
         elements = round((self.answers.shape[-1] / 2) ** 0.5)  # products y y^H have a real and an imaginary part
         shape = {"spectra": (PAS_HEIGHT, PAS_WIDTH), "snapshots": (elements,), "power": ()}[self.what]
@@ -96,17 +97,31 @@ class Locator:
         wanted = (len(self.plans), len(self.frequencies_hz), *shape)
         if observed.shape not in (wanted, wanted[1:] if len(self.plans) == 1 else wanted):
             raise ValueError(f"the observation has shape {observed.shape}; expected {wanted}, or without the 1 of one receiver")
-        return _locate(self, observed.reshape(-1, *shape))
+        return _locate(self, self._links(observed))
 
     def loss(self, places: Float[Array, "k 3"], observed: Array, blur: Any) -> Float[Array, " k"]:
         """Returns the mismatch between the predictions at K positions and an observation; differentiable in reverse mode.
 
         Args:
             places: world frame, metres.
-            observed: (receivers * frequencies, ...), spectra, snapshots or powers.
+            observed: (receivers * frequencies, ...) or (receivers, frequencies, ...), spectra, snapshots or powers.
             blur: metres over which predictions are smoothed, if the field has interference fringes.
+
+        Raises:
+            ValueError: too few powers were received.
         """
-        return _loss(_residuals(self, self.predict(places, blur), _target(self.what, observed)))
+        return _loss(_residuals(self, self.predict(places, blur), _target(self.what, self._links(observed))))
+
+    def _links(self, observed: Array) -> Array:
+        """Returns an observation with one leading axis, of receivers and frequencies."""
+        observed = jnp.asarray(observed)
+        own = observed.ndim - {"spectra": 2, "snapshots": 1, "power": 0}[self.what]
+        known, fewest = concrete(observed), 1 if self.known_power else 2
+        if self.what == "power" and known is not None and (count := np.sum(known > NO_PATH_DB)) < fewest:
+            raise ValueError(
+                f"{count} of the observed powers are above {NO_PATH_DB:g} dB; at least {fewest} are needed for a position"
+            )
+        return observed.reshape(-1, *observed.shape[own:])
 
     def predict(self, places: Float[Array, "k 3"], blur: Any) -> Float[Array, "k links m"]:
         """Returns the predictions at K positions, in the form that is compared: (k, receivers * frequencies, m)."""
