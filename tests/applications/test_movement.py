@@ -10,6 +10,7 @@ import trimesh
 from builders.mirrors import trained
 from builders.rooms import METAL, SPEED_OF_LIGHT, box, field_of, rectangle, room
 from builders.untrained import make_field, make_params
+from scipy.signal import stft as scipy_stft
 from scipy.special import fresnel
 
 from wbgs_jax._util.errors import UserError
@@ -31,6 +32,7 @@ from wbgs_jax.types import make_query, make_receiver
 HZ = 60e9
 SMALL = {"mirror_areas": (0.0, 0.5), "specular_tried": 64, "specular_kept": 32, "diffracted_tried": 64, "diffracted_kept": 32}
 PARTS = [*room(), box((3.0, 2.6, 0.0), (3.6, 3.2, 1.0))]
+WHOLE = {"return_onesided": False, "boundary": None, "padded": False}
 RX, TX = np.array([0.8, 1.9, 1.1]), np.array([5.2, 2.2, 1.3])
 
 
@@ -164,6 +166,19 @@ def test_nothing_jumps_while_paths_remain(rng):
     assert np.ptp(power) > 5  # the line of sight is blocked in between
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 9])
+def test_spectrograms_of_short_channels_and_windows_are_those_of_scipy(rng, count):
+    """Neighbouring windows are at least one sample apart."""
+    response = rng.normal(size=count) + 1j * rng.normal(size=count)
+    for window in range(1, count + 1):
+        hertz, times, power = doppler_spectrogram(jnp.asarray(response, jnp.complex64), 10.0, window)
+        overlap = window - max(window // 4, 1)
+        known = scipy_stft(response, 10.0, nperseg=window, noverlap=overlap, **WHOLE)
+        np.testing.assert_allclose(hertz, np.fft.fftshift(known[0]), atol=1e-5)
+        np.testing.assert_allclose(times, known[1], rtol=1e-5)
+        np.testing.assert_allclose(10 ** (power / 10), np.fft.fftshift(np.abs(known[2]) ** 2, 0), rtol=1e-3, atol=1e-6)
+
+
 def test_a_person_is_a_closed_body_with_its_measures():
     corners = person([1.0, 2.0, 0.5], azimuth=np.pi / 2)
     np.testing.assert_allclose(np.ptp(corners, axis=0), [0.5, 0.24, 1.75], atol=1e-12)
@@ -190,6 +205,9 @@ def test_what_cannot_move():
         make_movement(field, 4, {1: np.zeros((4, 3))})
     with pytest.raises(ValueError, match=r"expected \(4, 3\)"):
         make_movement(field, 4, {0: np.zeros((3, 3))})
+    for permittivity, conductivity in ((0.9, 0.1), (1.0, 0.1), (np.nan, 0.1), (5.0, -1.0), (5.0, np.nan)):
+        with pytest.raises(UserError, match="is no material"):
+            add_body(field, params, person([2, 2, 0]), permittivity, conductivity)
     with pytest.raises(UserError, match="one plane"):
         add_body(field, params, np.eye(3))
     with pytest.raises(UserError, match="predicts only the receivers"):

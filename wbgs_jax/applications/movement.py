@@ -79,9 +79,12 @@ def add_body(
         The field, its parameters, and the number of the body in `make_movement`.
 
     Raises:
-        UserError: the field does not trace paths, or the corners span no body.
+        UserError: the field does not trace paths, the corners span no body, or no material has these properties.
     """
     field, params = _tracing(field, params)
+    if not (permittivity > 1 and conductivity >= 0):
+        given = f"a body of relative permittivity {permittivity:g} and conductivity {conductivity:g} S/m"
+        raise UserError(f"{given} is no material; give a permittivity above 1 and a conductivity of at least 0")
     points = np.asarray(corners, float)
     if np.linalg.matrix_rank(points - points.mean(0), tol=1e-4) < 3:
         raise UserError("the corners of the body lie in one plane; give at least four corners that span a volume, in metres")
@@ -283,7 +286,13 @@ def doppler_spectrogram(
     """
     window = min(window, len(response))
     hertz, seconds, found = jax.scipy.signal.stft(
-        response, rate_hz, nperseg=window, noverlap=window - window // 4, return_onesided=False, boundary=None, padded=False
+        response,
+        rate_hz,
+        nperseg=window,
+        noverlap=window - max(window // 4, 1),
+        return_onesided=False,
+        boundary=None,
+        padded=False,
     )
     power = jnp.fft.fftshift(jnp.abs(found) ** 2, 0)
     return jnp.fft.fftshift(hertz), seconds, decibels(power)
