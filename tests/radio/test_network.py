@@ -52,6 +52,25 @@ def test_a_faint_interferer_is_not_lost_in_rounding():
     np.testing.assert_allclose(found, [100 - 10 * np.log10(1 + 1e-3), -100], atol=1e-3)
 
 
+def test_where_nothing_is_received_nothing_is_served():
+    found = sinr_db(jnp.array([[-jnp.inf, -jnp.inf], [-60.0, -jnp.inf]]), -60.0)
+    np.testing.assert_allclose(found, [[-np.inf, -np.inf], [0, -np.inf]], atol=1e-5)
+    np.testing.assert_allclose(throughput_bps(found, 1e6), [[0, 0], [1e6, 0]], rtol=1e-5)
+
+
+def test_impossible_loads_and_bandwidths_are_refused():
+    powers = jnp.array([-60.0, -70.0])
+    for load in (-0.1, 1.5, [1.0, np.nan]):
+        with pytest.raises(ValueError, match="activities are from 0 to 1"):
+            sinr_db(powers, -90.0, load)
+    for function in (noise_dbm, lambda hertz: throughput_bps(0, hertz)):
+        for hertz in (-1e6, jnp.array([1e6, -1e6])):
+            with pytest.raises(ValueError, match="not negative"):
+                function(hertz)
+        assert np.isfinite(jax.jit(function)(1e6))
+    np.testing.assert_array_equal(jax.jit(sinr_db)(powers, -90.0, 1.0), sinr_db(powers, -90.0))
+
+
 def test_throughput_is_the_bound_of_shannon():
     ratios = np.array([-60.0, 0.0, 30.0])
     found = throughput_bps(jnp.asarray(ratios, jnp.float32), 20e6)

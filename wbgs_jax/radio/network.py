@@ -8,8 +8,10 @@ frequencies or places. Definitions are those of Sionna RT's `RadioMap`: the rece
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from wbgs_jax._util.checks import concrete
 from wbgs_jax.radio.array import EXACT
 
 BOLTZMANN = 1.380649e-23
@@ -31,10 +33,14 @@ def noise_dbm(
     Returns:
         dBm (*b,).
 
+    Raises:
+        ValueError: a negative bandwidth.
+
     Example:
         >>> round(float(noise_dbm(100e6, 7.0, 290.0)), 1)
         -87.0
     """
+    _check_bandwidth(bandwidth_hz)
     return 10 * jnp.log10(jnp.asarray(bandwidth_hz, float) * temperature_k) + 10 * jnp.log10(BOLTZMANN * 1e3) + noise_figure_db
 
 
@@ -52,7 +58,10 @@ def sinr_db(
         load: (tx,) or one, mean activity of the transmitters as interferers, 0 to 1.
 
     Returns:
-        Decibels (*b, tx). The best server is `jnp.argmax(received_dbm, -1)`.
+        Decibels (*b, tx), minus infinity where nothing is received. The best server is `jnp.argmax(received_dbm, -1)`.
+
+    Raises:
+        ValueError: a load is not within 0 to 1.
 
     Example:
         >>> import jax.numpy as jnp
@@ -60,9 +69,13 @@ def sinr_db(
         [-3.01, -3.01]
     """
     received_dbm, load = jnp.asarray(received_dbm), jnp.asarray(load)
+    known = concrete(load)
+    if known is not None and not np.all((known >= 0) & (known <= 1)):
+        raise ValueError(f"load is {known}; activities are from 0 to 1")
     # Relative to the strongest, so that squares of faint amplitudes do not underflow; of the others only, since the difference
     # of a sum and its largest term is lost in rounding.
     strongest = jnp.max(received_dbm, -1, keepdims=True)
+    strongest = jnp.where(strongest > -jnp.inf, strongest, 0)
     power = 10 ** ((received_dbm - strongest) / 10)
     others = jnp.broadcast_to(load, received_dbm.shape[-1:])[:, None] * (1 - jnp.eye(received_dbm.shape[-1]))
     interference = jnp.matmul(power, others, precision=EXACT)
@@ -80,8 +93,18 @@ def throughput_bps(sinr_db: Any, bandwidth_hz: Float[Array, "*b"] | float) -> Fl
     Returns:
         Bits per second (*b,).
 
+    Raises:
+        ValueError: a negative bandwidth.
+
     Example:
         >>> round(float(throughput_bps(jnp.array(0.0), 100e6)) / 1e6)
         100
     """
+    _check_bandwidth(bandwidth_hz)
     return bandwidth_hz * jnp.log1p(10 ** (jnp.asarray(sinr_db) / 10)) / jnp.log(2)
+
+
+def _check_bandwidth(bandwidth_hz: Any) -> None:
+    known = concrete(bandwidth_hz)
+    if known is not None and not np.all(known >= 0):
+        raise ValueError(f"bandwidth_hz is {known}; bandwidths are in hertz and not negative")
