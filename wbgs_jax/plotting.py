@@ -545,7 +545,8 @@ def _drawn(quantity: Quantity, answer: dict[str, np.ndarray]) -> Float[np.ndarra
     if quantity.name == "power":
         received = values > NO_PATH_DB
     elif quantity.name in NETWORK:
-        received = answer["received_dbm"].max(0) > NO_PATH_DB
+        relative = answer["received_dbm"] - answer["tx_power_dbm"][:, None, None, None]
+        received = relative.max(0) > NO_PATH_DB
     drawn = quantity.scale * np.where(received, values, np.nan)
     return drawn[..., 0] if drawn.ndim > 3 else drawn
 

@@ -174,7 +174,7 @@ def test_sinr_and_throughput_are_those_of_the_best_server(monkeypatch):
     fields = [object.__new__(LoadedField)] * 2
     found = radio_map.evaluate_network(fields, plane, hertz, Network((0.0,), (0.0, 1.0), 1e6, 0.0))
     ratio = sinr_db([-50.0, -51.0], noise_dbm(1e6), [0.0, 1.0])[0]
-    assert found["best_server"] == 0 and found["rsrp_dbm"] == -50
+    assert found["best_server"] == 0 and found["rsrp_dbm"] == -50 and (found["tx_power_dbm"] == 0).all()
     np.testing.assert_allclose(found["sinr_db"].item(), ratio, atol=1e-4)
     np.testing.assert_allclose(found["throughput_bps"].item(), throughput_bps(ratio, 1e6), rtol=1e-4)
 

@@ -253,6 +253,18 @@ def test_the_distribution_counts_links_without_paths_as_lower_and_single_paths_a
     np.testing.assert_allclose(curve.get_xydata(), [[1, 0.5], [3, 0.75]])
 
 
+@pytest.mark.parametrize("dbm", [60.0, -20.0])
+def test_what_is_received_does_not_depend_on_the_transmitted_power(dbm):
+    """-300 dB of it, the first place, means that there is no path, and -240 dB that there is one."""
+    received = np.array([[[[-300.0, -300.0], [-240.0, -80.0]]], [[[-300.0, -90.0], [-300.0, -300.0]]]]) + dbm
+    answer = {"rsrp_dbm": received.max(0), "received_dbm": received, "tx_power_dbm": np.full(2, dbm), "height": 1.5}
+    answer |= {"xs": np.arange(2.0), "ys": np.arange(2.0), "frequencies_hz": HERTZ[:1], "tx_positions": np.eye(3)[:2]}
+    shown = draw_maps("rsrp", answer, WALLS, SOURCE).axes[0].images[0].get_array().filled(np.nan)
+    np.testing.assert_array_equal(np.isnan(shown), [[True, False], [False, False]])
+    (curve,) = draw_distribution("rsrp", answer | {"no_confidence": np.zeros((2, 2), bool)}).axes[0].lines
+    np.testing.assert_allclose(curve.get_xydata()[:, 0], np.array([-240, -90, -80]) + dbm)
+
+
 @pytest.mark.parametrize(
     ("outlier", "extend"), [(None, "neither"), (50.0, "max"), (-50.0, "min"), (np.inf, "max"), (np.nan, "neither")]
 )

@@ -78,8 +78,9 @@ def evaluate_network(
     network: Network,
     advance: Callable[[], None] = lambda: None,
 ) -> dict[str, np.ndarray]:
-    """Returns maps of several transmitters over the receivers of a plane: `received_dbm` (tx, freq, ny, nx) of each, and all
-    quantities of `quantities.NETWORK` by name with unit, (freq, ny, nx); and what `evaluate_plane` adds.
+    """Returns maps of several transmitters over the receivers of a plane: `received_dbm` (tx, freq, ny, nx) of each,
+    `tx_power_dbm` (tx,), all quantities of `quantities.NETWORK` by name with unit, (freq, ny, nx), and what `evaluate_plane`
+    adds.
 
     Channels are reciprocal: what a receiver of the plane receives from a transmitter equals what that transmitter would receive
     from it. So every transmitter is the receiver of a field, and the plane holds the transmitters of the field.
@@ -95,15 +96,15 @@ def evaluate_network(
         UserError: the field does not predict power.
     """
     maps = [evaluate_plane("power", field, plane, frequencies_hz, advance) for field in fields]
-    power = np.broadcast_to(network.power_dbm, len(fields))[:, None, None, None]
-    received = np.stack([one["power_db"] for one in maps]) + power
+    power = np.broadcast_to(np.asarray(network.power_dbm, np.float64), len(fields))
+    received = np.stack([one["power_db"] for one in maps]) + power[:, None, None, None]
     noise = noise_dbm(network.bandwidth_hz, network.noise_figure_db)
     each = jnp.moveaxis(jnp.asarray(received, jnp.float32), 0, -1)
     server, strongest = np.argmax(received, 0), received.max(0)
     ratios = sinr_db(each, noise, jnp.asarray(network.load, jnp.float32))
     best = jnp.take_along_axis(ratios, server[..., None], -1)[..., 0]  # with unequal loads, others may have larger ones
     found = {"rsrp_dbm": strongest, "sinr_db": best, "best_server": server}
-    found |= {"throughput_bps": throughput_bps(best, network.bandwidth_hz), "received_dbm": received}
+    found |= {"throughput_bps": throughput_bps(best, network.bandwidth_hz), "received_dbm": received, "tx_power_dbm": power}
     shared = {name: maps[0][name] for name in ("xs", "ys", "height", "frequencies_hz")}
     return {name: np.asarray(values) for name, values in found.items()} | shared
 
