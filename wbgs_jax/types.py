@@ -311,10 +311,14 @@ def make_query(
     Returns:
         Positions (b, 3) and frequencies (b,), and the further properties with a leading axis of b where given.
 
+    Raises:
+        ValueError: an orientation of zero length.
+
     Example:
         >>> make_query([[0.0, 0.0, 1.5], [1.0, 0.0, 1.5]], 28e9).frequency_hz.shape
         (2,)
     """
+    _check_orientation("orientation", orientation)
     position = jnp.atleast_2d(jnp.asarray(tx_position, jnp.float32))
     count = position.shape[0]
 
@@ -325,6 +329,13 @@ def make_query(
         position, rows(orientation, 4), rows(velocity, 3), repeat_antenna(antenna, count), rows(power_dbm)
     )
     return Query(transmitter, rows(frequency_hz), time_s=rows(time_s))
+
+
+def _check_orientation(name: str, orientation: Any) -> None:
+    """Raises an error for quaternions (..., 4) of zero length; None and traced ones pass."""
+    known = None if orientation is None else concrete(jnp.asarray(orientation))
+    if known is not None and not (np.linalg.norm(known, axis=-1) > 1e-6).all():
+        raise ValueError(f"{name} has zero length; pass a quaternion (w, x, y, z), (1, 0, 0, 0) for no rotation")
 
 
 def repeat_antenna(antenna: Antenna | None, count: int) -> Antenna | None:
@@ -346,6 +357,7 @@ def check_query(query: Query) -> None:
     for name, shape in optional.items():
         if (values := getattr(transmitter, name)) is not None:
             check_array(f"transmitter.{name}", values, shape)
+    _check_orientation("transmitter.orientation", transmitter.orientation)
     if query.time_s is not None:
         check_array("time_s", query.time_s, (count,))
     frequency, position = concrete(query.frequency_hz), concrete(query.tx_position)

@@ -46,6 +46,15 @@ def test_who_knows_the_truth_is_always_right(rng):
     assert score_beams(truth, truth) == (1, 1, 0, 0)
 
 
+def test_spectra_of_other_links_and_missing_ones_are_refused(rng):
+    truth = rng.random((5, 90, 360)).astype(np.float32)
+    wrong = truth.copy()
+    wrong[2, 3, 4] = np.nan
+    for predicted, true, words in ((truth[:1], truth, "same links"), (truth, wrong, "true"), (wrong, truth, "predicted")):
+        with pytest.raises(ValueError, match=words):
+            score_beams(predicted, true)
+
+
 def test_beams_for_transmitters_are_those_of_their_spectra(rng):
     spectra = rng.random((20, 90, 360)).astype(np.float32)
     positions = np.arange(60.0).reshape(20, 3)

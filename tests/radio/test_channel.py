@@ -1,5 +1,7 @@
 """Power, gain, K-factor and delay spread of channels whose answer is known."""
 
+import inspect
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,6 +42,24 @@ def test_one_path_and_none():
     ahead = jnp.broadcast_to(jnp.array([1.0, 0, 0]), (1, 2, 3))
     assert (channel.angular_spread_deg(one._replace(direction=ahead)) == 0).all()
     assert np.isnan(channel.angular_spread_deg(none)).all()
+
+
+def test_doppler_shifts_of_several_links_need_vmap(rng):
+    """Velocities of two links would be taken for those of their two paths."""
+    ways = jnp.asarray(rng.normal(size=(2, 2, 3)), jnp.float32)
+    found = arrivals(np.ones((2, 2)), np.ones((2, 2)))._replace(departure=ways, arrival=ways)
+    hertz, velocity = jnp.array([1e9, 2e9]), jnp.asarray(rng.normal(size=(2, 3)), jnp.float32)
+    unchecked = inspect.unwrap(channel.doppler_hz)
+    for name, given in (
+        ("frequency_hz", (hertz, velocity[0], velocity[0])),
+        ("tx_velocity", (hertz[0], velocity, velocity[0])),
+        ("rx_velocity", (hertz[0], velocity[0], velocity)),
+    ):
+        with pytest.raises(ValueError, match=f"{name} has shape .* use jax.vmap"):
+            unchecked(found, *given)
+    shifts = jax.vmap(channel.doppler_hz)(found, hertz, velocity, -velocity)
+    expected = 2 * np.einsum("b,bkx,bx->bk", hertz, ways, velocity) / SPEED_OF_LIGHT
+    np.testing.assert_allclose(shifts, expected, rtol=1e-4, atol=1e-3)
 
 
 def at_angles(zenith, azimuth):

@@ -37,6 +37,16 @@ def test_an_upright_isotropic_antenna_is_vertical_polarisation_alone(rng):
     np.testing.assert_allclose(upright(jnp.zeros(2)).field(k), zenith_vector(k), atol=1e-6)
 
 
+def test_several_antennas_need_vmap(rng):
+    """The exponents of two antennas would be taken for those of one."""
+    both, k = Antenna(None, jnp.array([[1.0, 0.0], [0.0, 1.0]])), jnp.asarray(directions(rng))
+    for gains in (both.field, both.parametric_gain):
+        with pytest.raises(ValueError, match=r"shape \(2, 2\); use jax.vmap for several antennas"):
+            gains(k)
+    found = jax.vmap(lambda one: one.parametric_gain(k))(both)
+    np.testing.assert_allclose(found, [element_gain(k), dipole_gain(k)], rtol=1e-5)
+
+
 @pytest.mark.parametrize("pattern", ["iso", "tr38901", "dipole"])
 def test_a_turned_antenna_seen_from_a_turned_direction_is_itself_turned(pattern, rng):
     turn, k = Rotation.from_quat(rng.normal(size=4)), directions(rng)

@@ -9,7 +9,7 @@ import pytest
 import wbgs_jax as wb
 from wbgs_jax.fields.coherent_model import WavePlan
 from wbgs_jax.fields.networks import positional_encoding
-from wbgs_jax.types import stack_receivers
+from wbgs_jax.types import check_query, stack_receivers
 
 CONFIG = wb.wideband.WidebandConfig(width=8, depth=2)
 LIMITS = wb.splat.TileLimits(entries=4096, jobs=1024)
@@ -91,6 +91,18 @@ def test_a_wrong_receiver_is_refused(field, planned):
     three = wb.Receiver(jnp.zeros((3, 3)), jnp.ones((3, 4)), jnp.zeros((3, 1, 3)), jnp.zeros((3, 2)))
     with pytest.raises(ValueError, match=r"receiver.position has shape \(3, 3\); expected \(3,\)"):
         field.plan(params, three)
+
+
+def test_a_transmitter_without_orientation_is_refused():
+    """Also one of several, and as part of a query that was made by hand."""
+    for orientation in ([0, 0, 0, 0], [[1, 0, 0, 0], [0, 0, 0, 0]], [np.nan, 0, 0, 0]):
+        with pytest.raises(ValueError, match="orientation has zero length"):
+            wb.make_query(jnp.zeros((2, 3)), 28e9, orientation=orientation)
+    transmitter = wb.radio.Transmitter(jnp.zeros((1, 3)), jnp.zeros((1, 4)))
+    with pytest.raises(ValueError, match=r"transmitter.orientation has zero length"):
+        check_query(wb.Query(transmitter, jnp.full(1, 28e9)))
+    made = jax.jit(lambda orientation: wb.make_query(jnp.zeros(3), 28e9, orientation=orientation))(jnp.zeros(4))
+    assert made.transmitter.orientation.shape == (1, 4)
 
 
 def test_a_wrong_surface_is_refused():

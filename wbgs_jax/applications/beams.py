@@ -3,14 +3,13 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from wbgs_jax.inference.batching import predict_many
 from wbgs_jax.inference.predictor import Predictor
 from wbgs_jax.metrics import beam_loss_db
 from wbgs_jax.radio.array import ALIKE, codebook, pas_directions
 
-AnyArray = Array | np.ndarray
 RIGHT_DB = float(-20 * np.log10(1 - ALIKE))
 """A beam that receives at most this much less than the best one (0.45 dB) counts as equally good: a planar array receives
 equally ahead and behind."""
@@ -72,16 +71,27 @@ def choose_beams(predict: Predictor, tx_positions: Any, frequencies_hz: Any, cou
     return rank_beams(predict_many(predict, tx_positions, frequencies_hz), count)
 
 
-def score_beams(predicted: Float[AnyArray, "n 90 360"], truth: Float[AnyArray, "n 90 360"]) -> BeamScores:
+def score_beams(predicted: Any, truth: Any) -> BeamScores:
     """Returns the quality, in true spectra, of the beams that predicted spectra rank highest.
 
     Args:
-        predicted: spectra of a field.
-        truth: measured spectra of the same links.
+        predicted: (n, 90, 360), spectra of a field.
+        truth: (n, 90, 360), measured spectra of the same links.
 
     Returns:
         Shares of links and losses in dB (`BeamScores`).
+
+    Raises:
+        ValueError: the numbers of spectra differ, or some values are not finite.
     """
-    first, three = (beam_loss_db(np.asarray(predicted), np.asarray(truth), tried) for tried in (1, 3))
+    predicted, truth = np.asarray(predicted), np.asarray(truth)
+    if predicted.shape != truth.shape:
+        raise ValueError(
+            f"predicted spectra have shape {predicted.shape}, true ones {truth.shape}; pass those of the same links"
+        )
+    for name, spectra in (("predicted", predicted), ("true", truth)):
+        if not np.isfinite(spectra).all():
+            raise ValueError(f"some {name} spectra have values that are not finite; leave these links out")
+    first, three = (beam_loss_db(predicted, truth, tried) for tried in (1, 3))
     top1, top3 = (float(np.mean(loss <= RIGHT_DB)) for loss in (first, three))
     return BeamScores(top1, top3, float(first.mean()), float(three.mean()))

@@ -104,7 +104,12 @@ class Antenna:
 
     @jax.jit
     def field(self, direction: Float[Array, "*m 3"]) -> Inexact[Array, "*m 3"]:
-        """Returns the polarised amplitude gain of one antenna in unit directions: a vector across each direction."""
+        """Returns the polarised amplitude gain of one antenna in unit directions: a vector across each direction.
+
+        Raises:
+            ValueError: several antennas; use `jax.vmap`.
+        """
+        self._check_single()
         rotation = None if self.orientation is None else rotation_matrix(self.orientation)
         own = direction if rotation is None else jnp.matmul(direction, rotation, precision=EXACT)
         gain = _parametric_gain(own, self.exponents)
@@ -114,9 +119,18 @@ class Antenna:
         return gain[..., None] * (field if rotation is None else jnp.matmul(field, rotation.T, precision=EXACT))
 
     def parametric_gain(self, direction: Float[Array, "*m 3"]) -> Float[Array, "*m"]:
-        """Returns the amplitude gain of the two parametric patterns of one antenna in unit directions."""
+        """Returns the amplitude gain of the two parametric patterns of one antenna in unit directions.
+
+        Raises:
+            ValueError: several antennas; use `jax.vmap`.
+        """
+        self._check_single()
         own = direction if self.orientation is None else to_local(direction, self.orientation)
         return _parametric_gain(own, self.exponents)
+
+    def _check_single(self) -> None:
+        if self.exponents.ndim != 1:
+            raise ValueError(f"exponents of the antenna have shape {self.exponents.shape}; use jax.vmap for several antennas")
 
     def rotated(self, orientation: Float[Array, "4"]) -> "Antenna":
         """Returns one antenna after a further rotation by a quaternion (wxyz)."""

@@ -277,7 +277,14 @@ def doppler_hz(
 
     Returns:
         Hertz (*b, k), positive if the path gets shorter.
+
+    Raises:
+        ValueError: more than one frequency or velocity of an end; use `jax.vmap` for several.
     """
+    ends = ("frequency_hz", frequency_hz, ()), ("tx_velocity", tx_velocity, (3,)), ("rx_velocity", rx_velocity, (3,))
+    for name, value, shape in ends:
+        if jnp.shape(value) != shape:
+            raise ValueError(f"{name} has shape {jnp.shape(value)}; expected {shape}, and use jax.vmap for several")
     assert arrivals.departure is not None and arrivals.arrival is not None, (
         "only arrivals of traced paths have these directions"
     )
