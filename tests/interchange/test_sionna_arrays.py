@@ -182,7 +182,7 @@ def test_vertices_of_the_other_side_are_in_the_other_order(rng):
         (lambda arrays: {"theta_r": np.degrees(arrays["theta_r"])}, "theta_r is .*; give radians, not degrees"),
         (lambda arrays: {"phi_t": np.degrees(arrays["phi_t"])}, "phi_t is .*; give radians, not degrees"),
         (lambda arrays: {"a": 20 * np.log10(np.abs(arrays["a"])) + 0j}, "give amplitudes, not decibels"),
-        (lambda arrays: {"a": arrays["a"][..., None]}, "6 axes, including time"),
+        (lambda arrays: {"a": arrays["a"][..., None]}, "6 axes, including time, as that of paths.cir.*; give `paths.a`"),
         (lambda arrays: {"a": arrays["a"][:, :7]}, "have 7 antennas|do not fit"),
         (lambda arrays: {"sources": 1e3 * arrays["sources"]}, "positions in metres"),
         (lambda arrays: {"theta_t": np.abs(np.pi / 2 - arrays["theta_t"])}, "theta_t, phi_t of lines of sight"),
@@ -209,6 +209,34 @@ def test_lines_of_sight_have_the_length_of_the_line(rng):
     del known["frequency_hz"]
     with pytest.raises(UserError, match="street does not record its frequency; give --ghz"):
         scene_of_sionna(known, "street")
+
+
+@pytest.mark.parametrize("shape", [(4, 4), (1, 1)])
+@pytest.mark.parametrize("synthetic", [True, False])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_coefficients_that_contain_the_carrier_are_refused(rng, shape, synthetic, sign):
+    """Of `paths.cir()`, and with the other sign of time; the true coefficients of lines of sight agree."""
+    arrays = Traced(rng, shape, synthetic=synthetic).arrays
+    pair = arrays["a"][:, :1, ..., :1] * arrays["a"][:, -1:, ..., :1]
+    centre = np.exp(-0.5j * np.angle(pair))  # lines of sight then have the phase 0 or pi at the centre
+    a = arrays["a"].copy()
+    a[..., :1] *= centre
+    arrays |= {"a": a}
+    scene_of_sionna(arrays, "street", shape=(4, 4))
+    tau = arrays["tau"][:, None, :, None] if synthetic else arrays["tau"]
+    turned = arrays | {"a": arrays["a"] * np.exp(2j * np.pi * sign * FREQUENCY * tau)}
+    with pytest.raises(UserError, match=r"street: a contains the phase of the carrier, .* give paths\.a"):
+        scene_of_sionna(turned, "street", shape=(4, 4))
+
+
+@pytest.mark.skipif(not CASES.exists(), reason="the small inputs are not beside the repository")
+@pytest.mark.parametrize("mode", ["syn", "full"])
+def test_real_coefficients_with_the_carrier_are_refused(mode):
+    arrays = read_paths(CASES / "sionna_arrays" / f"paths_{mode}.npz")
+    tau = arrays["tau"][:, None, :, None] if arrays["tau"].ndim == 3 else arrays["tau"]
+    turned = arrays | {"a": arrays["a"] * np.exp(-2j * np.pi * arrays["frequency_hz"] * tau)}
+    with pytest.raises(UserError, match=r"street: a contains the phase of the carrier, .* give paths\.a"):
+        scene_of_sionna(turned, "street")
 
 
 @pytest.mark.skipif(not CASES.exists(), reason="the small inputs are not beside the repository")

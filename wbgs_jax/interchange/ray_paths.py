@@ -354,12 +354,13 @@ SLACK, SLACK_M = 1e-3, 0.1
 """Relative and absolute amount by which a path may be shorter than the straight line, for rounding and off-centre elements."""
 
 
-def check_paths(paths: RayPaths, name: str) -> None:
+def check_paths(paths: RayPaths, name: str, opposite: Complex[np.ndarray, "r t k"] | None = None) -> None:
     """Raises a `UserError` for paths that contradict physics or their positions.
 
     Args:
         paths: to check.
         name: of the paths, for messages.
+        opposite: coefficients of the antennas on the other side of the arrays' centres, if antennas share their delays.
     """
     valid = paths.valid
     if not valid.any():
@@ -392,7 +393,7 @@ def check_paths(paths: RayPaths, name: str) -> None:
             "positions in metres, and a row of three numbers for every position"
         )
     _check_vertices(paths, name, length)
-    _check_line_of_sight(paths, name, length, straight[..., None])
+    _check_line_of_sight(paths, name, length, straight[..., None], paths.a if opposite is None else opposite)
 
 
 def _check_vertices(paths: RayPaths, name: str, length: Float[np.ndarray, "r t k"]) -> None:
@@ -420,13 +421,31 @@ def _check_vertices(paths: RayPaths, name: str, length: Float[np.ndarray, "r t k
 
 
 def _check_line_of_sight(
-    paths: RayPaths, name: str, length: Float[np.ndarray, "r t k"], straight: Float[np.ndarray, "r t 1"]
+    paths: RayPaths,
+    name: str,
+    length: Float[np.ndarray, "r t k"],
+    straight: Float[np.ndarray, "r t 1"],
+    opposite: Complex[np.ndarray, "r t k"],
 ) -> None:
-    """Raises a `UserError` if lines of sight do not arrive from the other end."""
+    """Raises a `UserError` if lines of sight do not arrive from the other end, or have phases that follow their delays."""
     same, same_m = 1e-4, 0.01  # relative and absolute tolerance within which a path counts as the line of sight
     sight = paths.valid & (np.abs(length - straight) <= straight * same + same_m)
     ends = {"r": paths.sources[None, :, None], "t": paths.targets[:, None, None]}
     _check_directions(paths, name, sight, ends, "of lines of sight", "the other end")
+    # The phases of antennas on opposite sides of a centre cancel in the product of their coefficients, as do the signs of
+    # polarised ones.
+    direct = sight & ~(paths.interactions != NONE).any(0)
+    product, turn = (paths.a * opposite)[direct], carrier(2 * paths.frequency_hz, paths.tau[direct])
+    product, turn = product[product != 0], turn[product != 0]
+    alike, different, fewest = 0.9, 0.7, 5  # lengths of mean phasors that agree and that differ, and number of lines of sight
+    if len(product) < fewest:
+        return
+    given, with_it, conjugated = (abs((product / np.abs(product) * one).mean()) for one in (1, turn.conj(), turn))
+    if given < different and max(with_it, conjugated) > alike:
+        raise UserError(
+            f"{name}: a contains the phase of the carrier, as that of Sionna's paths.cir() does: lines of sight turn with "
+            "their delays; give paths.a"
+        )
 
 
 def _check_directions(

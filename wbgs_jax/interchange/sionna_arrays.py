@@ -116,7 +116,7 @@ def scene_of_sionna(
     what = source or name
     arrays = {key: found for key in OF_PATHS if (found := array_of(paths, key)) is not None}
     if "a" in arrays and arrays["a"].ndim > ARRAYS:
-        raise UserError(f"a of {what} has {arrays['a'].ndim} axes, including time; give `paths.a` for a single instant")
+        raise UserError(f"a of {what} has {arrays['a'].ndim} axes, including time, as that of paths.cir(); give `paths.a`")
     check_arrays(arrays, f"the paths of {what}")
     for end in ("sources", "targets"):
         if (found := array_of(paths, end)) is not None:
@@ -130,13 +130,15 @@ def scene_of_sionna(
     tx_index = _chosen(arrays["a"].shape[3], tx_antenna, f"the transmitters of {what} have", "--tx-antenna")
     chosen, shape = _elements(arrays["a"], shape, port, what)
     first = from_sionna(arrays, frequency, antennas=(int(chosen[0]), tx_index))
-    check_paths(first, what)
+    shared = arrays["tau"].ndim < ARRAYS
+    across = int(chosen[-1]), arrays["a"].shape[3] - 1 - tx_index
+    check_paths(first, what, from_sionna(arrays, frequency, antennas=across).a if shared else None)
     if len(chosen) == 1:
         return scene_of_paths([first], planar_array(*(shape or DEFAULT)), name, room=room)
     a, tau, direction = _of_antennas(arrays, chosen, tx_index)
     valid = np.isfinite(a) & (tau >= 0)
     snapshots = np.where(valid, a * carrier(first.frequency_hz, tau), 0).sum(-1)  # receiver, antenna, transmitter
-    if arrays["tau"].ndim == ARRAYS:
+    if not shared:
         places = np.asarray(arrays.get("targets", np.full((a.shape[0], 3), np.nan)), np.float64)
         devices = _by_places(places, a.shape[:2], shape, SPEED_OF_LIGHT / first.frequency_hz, what)
     else:
