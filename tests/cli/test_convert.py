@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 from builders.commands import assert_error_for_people, call
+from builders.drawn_paths import bounced_paths
 from builders.untrained import make_coherent_run, make_run
+from scipy.io import savemat
 
 from wbgs_jax.commands import convert as convert_command
 from wbgs_jax.data.load import load_dataset
@@ -52,6 +54,31 @@ def test_paths_out_and_in_again(runs, tmp_path):
     one, other = (load_dataset(tmp_path / f"{name}.npz") for name in ("one", "other"))
     assert one.snapshots.shape == (6, 4) and len(one.test) == 1
     np.testing.assert_allclose(one.snapshots, other.snapshots, rtol=1e-2, atol=1e-3 * np.abs(one.snapshots).max())
+
+
+@pytest.mark.parametrize("suffix", [".mat", ".MAT", ".NPZ"])
+def test_arrays_of_sionna_in_files_of_any_kind(tmp_path, suffix):
+    paths = bounced_paths(np.random.default_rng(0), transmitters=6)
+    arrays = paths.as_sionna() | {"frequency_hz": np.array([paths.frequency_hz])}
+    for file in (tmp_path / "plain.npz", tmp_path / f"paths{suffix}"):
+        with file.open("wb") as stream:
+            if file.suffix.lower() == ".mat":
+                savemat(stream, arrays)
+            else:
+                np.savez(stream, **arrays)
+        convert("--paths", file, "--array", "2x2", "--out", tmp_path / f"{file.stem}_scene.npz")
+    one, other = (load_dataset(tmp_path / f"{name}_scene.npz") for name in ("plain", "paths"))
+    np.testing.assert_array_equal(one.snapshots, other.snapshots)
+
+
+def test_files_without_arrays_are_read_before_a_frequency_is_asked_for(tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "a.mat").write_bytes(b"")
+    (tmp_path / "v4.mat").write_bytes(bytes(200))
+    for name, words in (("empty", "has no files such as"), ("a.mat", "a.mat"), ("v4.mat", "not a .mat file of version 5")):
+        refused = call(convert_command.main, "--paths", tmp_path / name, "--out", tmp_path / "out.npz")
+        assert_error_for_people(refused, words)
+        assert "frequency" not in refused.err
 
 
 def test_a_model_becomes_a_room_beside_spectra(tmp_path):

@@ -135,6 +135,15 @@ def test_lines_of_sight_show_whether_phases_hold_it(rng, holds):
         np.testing.assert_allclose(from_deepmimo(arrays, 3.5e9, otherwise).channel()[:, 0], channel, rtol=2e-3, atol=1e-5)
 
 
+def test_phases_of_the_opposite_sign_are_refused_and_others_noted(rng):
+    arrays = as_deepmimo(two_rays(rng)[0])
+    for otherwise in (True, False):
+        with pytest.raises(UserError, match="lines of sight grow with their delays; give the opposite sign"):
+            from_deepmimo(arrays | {"phase": -arrays["phase"]}, 3.5e9, otherwise)
+        with pytest.warns(UserWarning, match=f"neither agree nor follow .* {'in' if otherwise else 'ex'}clude the propagation"):
+            from_deepmimo(arrays, 3.4e9, otherwise)
+
+
 def test_the_frequency_and_the_users_are_those_of_the_parameters(rng, tmp_path):
     rays, channel = two_rays(rng)
     write_deepmimo(tmp_path, as_deepmimo(rays), 3.5e9)

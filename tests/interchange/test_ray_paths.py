@@ -106,6 +106,18 @@ def test_values_that_no_valid_path_has(rng, name, value, words):
     check_paths(replace(paths, **{name: changed}, valid=valid), "room")
 
 
+def test_positions_in_larger_units_are_refused_without_vertices(rng):
+    paths = bounced_paths(rng)
+    unknown = replace(paths, interactions=paths.interactions[:0], vertices=paths.vertices[:0])
+    check_paths(unknown, "room")
+    hectometres = replace(unknown, sources=paths.sources / 100, targets=paths.targets / 100)
+    with pytest.raises(
+        UserError, match="room: every path is more than 3 times as long as the line .*; give positions in metres"
+    ):
+        check_paths(hectometres, "room")
+    check_paths(replace(unknown, targets=paths.sources[np.zeros(len(paths.targets), int)], tau=paths.tau + 1e-8), "radar")
+
+
 @pytest.mark.parametrize("end", ["r", "t"])
 def test_directions_without_lines_of_sight_are_compared_with_vertices(rng, end):
     paths = bounced_paths(rng, direct=False)

@@ -93,7 +93,11 @@ def read_pair(folder: Path, pair: Pair) -> dict[str, np.ndarray]:
 
 def read_file(path: Path) -> dict[str, np.ndarray]:
     """Returns the numeric arrays of an .npz or .mat file by name."""
-    return read_mat(path) if path.suffix == ".mat" else read_arrays(path, "", "check the path; give an .npz or a .mat file")
+    return (
+        read_mat(path)
+        if path.suffix.lower() == ".mat"
+        else read_arrays(path, "", "check the path; give an .npz or a .mat file")
+    )
 
 
 def parameters(folder: Path) -> dict[str, Any]:
@@ -236,7 +240,6 @@ def load_deepmimo(
     if not path.exists():
         raise UserError(f"cannot read {path}: the scenario does not exist; check the path")
     tracer, recorded_hz = _traced(parameters(path))
-    frequency = frequency_of(recorded_hz, frequency_hz, str(path))
     pairs = pairs_of(path, tx_set, tx, rx_set) if path.is_dir() else []
     found_arrays = [read_pair(path, pair) for pair in pairs] if pairs else [read_file(path)]
     every = [_complete(path, arrays) for arrays in found_arrays]
@@ -245,6 +248,7 @@ def load_deepmimo(
         raise UserError(f"{path}: its {len(every)} transmitters have different users; choose one, --tx-index {choices}")
     without_propagation = ("sionna",)  # ray tracers whose phases DeepMIMO's converters copy without the propagation
     lacks = any(name in tracer.lower() for name in without_propagation)
+    frequency = frequency_of(recorded_hz, frequency_hz, str(path))
     return joined([from_deepmimo(one, frequency, not lacks) for one in every])
 
 
@@ -330,10 +334,8 @@ def _depth(arrays: dict[str, np.ndarray]) -> int:
 
 
 def is_deepmimo(path: Path) -> bool:
-    """Returns whether a path is a DeepMIMO scenario rather than an archive of Sionna's arrays."""
-    if path.suffix != ".npz":
-        return True
-    return bool({"power", "phase"} & set(read_file(path)))
+    """Returns whether a path is a DeepMIMO scenario rather than a file of Sionna's arrays."""
+    return not path.is_file() or bool(set(NEEDED) & set(read_file(path)))
 
 
 def write_deepmimo(
@@ -364,6 +366,9 @@ def from_deepmimo(arrays: dict[str, np.ndarray], frequency_hz: float, propagatio
 
     Returns:
         The paths, in radians and seconds.
+
+    Raises:
+        UserError: the phases of lines of sight have the opposite sign.
     """
     power = np.asarray(arrays["power"], np.float64)
     valid = np.isfinite(power)
@@ -394,15 +399,28 @@ def from_deepmimo(arrays: dict[str, np.ndarray], frequency_hz: float, propagatio
 def _includes_propagation(
     phase: Float[np.ndarray, "n k"], turns: Float[np.ndarray, "n k"], direct: Bool[np.ndarray, "n k"], otherwise: bool
 ) -> bool:
-    """Returns whether phases include the propagation; without it, those of lines of sight are all equal."""
+    """Returns whether phases include the propagation; without it, those of lines of sight are all equal.
+
+    Raises:
+        UserError: they include it with the opposite sign.
+    """
     # Length of the mean phasor of lines of sight above which their phases agree and below which they differ; and how many are
     # needed.
     alike, different, fewest = 0.99, 0.6, 5
     if direct.sum() < fewest:
         return otherwise
-    without, with_it = (abs(np.exp(1j * own[direct]).mean()) for own in (phase, phase + turns))
+    without, with_it, negated = (abs(np.exp(1j * own[direct]).mean()) for own in (phase, phase + turns, phase - turns))
     if without > alike and with_it < different:
         return False
+    if negated > alike and max(without, with_it) < different:
+        raise UserError("the phases of this scenario's lines of sight grow with their delays; give the opposite sign")
+    if max(without, with_it) < different:
+        how = "include" if otherwise else "exclude"
+        warnings.warn(
+            f"the phases of this scenario's lines of sight neither agree nor follow their delays; they are taken to {how} the propagation: "
+            "check the frequency",
+            stacklevel=3,
+        )
     return True if with_it > alike and without < different else otherwise
 
 

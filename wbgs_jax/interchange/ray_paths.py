@@ -19,6 +19,7 @@ from jaxtyping import Bool, Complex, Float, Int, Integer
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, read_arrays
+from wbgs_jax.interchange.matlab import read_mat
 from wbgs_jax.propagation.paths import InteractionType, is_vertex
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ
@@ -236,12 +237,13 @@ def load_paths(path: Path | str, frequency_hz: float | None = None) -> RayPaths:
 
 
 def read_paths(path: Path | str) -> dict[str, np.ndarray]:
-    """Returns the arrays of an .npz file by name, with complex `a`.
+    """Returns the arrays of an .npz or .mat file by name, with complex `a`.
 
     Raises:
         UserError: the file is missing or damaged.
     """
-    arrays = read_arrays(Path(path), "", "check the path, or write it again")
+    path = Path(path)
+    arrays = read_mat(path) if path.suffix.lower() == ".mat" else read_arrays(path, "", "check the path, or write it again")
     if "a_real" in arrays and "a_imag" in arrays:
         arrays["a"] = _complex(arrays.pop("a_real"), arrays.pop("a_imag"), f"a of {path}")
     return arrays
@@ -391,6 +393,14 @@ def check_paths(paths: RayPaths, name: str, opposite: Complex[np.ndarray, "r t k
             f"{name}: a path is {length[r, t, k]:.3g} m long although transmitter {t + 1} and receiver {r + 1} are "
             f"{straight[r, t]:.3g} m apart; give delays in seconds from the transmitter on (Sionna: normalize_delays=False), "
             "positions in metres, and a row of three numbers for every position"
+        )
+    # Ratio to the straight line that all paths together exceed only if positions have another unit; vertices are more exact.
+    times, apart = 3.0, valid & (straight[..., None] > 0)
+    if not np.isfinite(paths.vertices).any() and apart.any() and (length > times * straight[..., None])[apart].all():
+        r, t, k = np.argwhere(apart)[0]
+        raise UserError(
+            f"{name}: every path is more than {times:g} times as long as the line between its ends, such as {length[r, t, k]:.3g} "
+            f"m from transmitter {t + 1} to receiver {r + 1}, {straight[r, t]:.3g} m apart; give positions in metres"
         )
     _check_vertices(paths, name, length)
     _check_line_of_sight(paths, name, length, straight[..., None], paths.a if opposite is None else opposite)
