@@ -112,7 +112,7 @@ def test_positions_in_larger_units_are_refused_without_vertices(rng):
     check_paths(unknown, "room")
     hectometres = replace(unknown, sources=paths.sources / 100, targets=paths.targets / 100)
     with pytest.raises(
-        UserError, match="room: every path is more than 3 times as long as the line .*; give positions in metres"
+        UserError, match=r"room: every path is more than 3 times as long as the line .* give positions in metres"
     ):
         check_paths(hectometres, "room")
     check_paths(replace(unknown, targets=paths.sources[np.zeros(len(paths.targets), int)], tau=paths.tau + 1e-8), "radar")

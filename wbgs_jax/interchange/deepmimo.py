@@ -417,8 +417,8 @@ def _includes_propagation(
     if max(without, with_it) < different:
         how = "include" if otherwise else "exclude"
         warnings.warn(
-            f"the phases of this scenario's lines of sight neither agree nor follow their delays; they are taken to {how} the propagation: "
-            "check the frequency",
+            "the phases of this scenario's lines of sight neither agree nor follow their delays; they are taken to "
+            f"{how} the propagation: check the frequency",
             stacklevel=3,
         )
     return True if with_it > alike and without < different else otherwise

@@ -399,8 +399,9 @@ def check_paths(paths: RayPaths, name: str, opposite: Complex[np.ndarray, "r t k
     if not np.isfinite(paths.vertices).any() and apart.any() and (length > times * straight[..., None])[apart].all():
         r, t, k = np.argwhere(apart)[0]
         raise UserError(
-            f"{name}: every path is more than {times:g} times as long as the line between its ends, such as {length[r, t, k]:.3g} "
-            f"m from transmitter {t + 1} to receiver {r + 1}, {straight[r, t]:.3g} m apart; give positions in metres"
+            f"{name}: every path is more than {times:g} times as long as the line between its ends, such as "
+            f"{length[r, t, k]:.3g} m from transmitter {t + 1} to receiver {r + 1}, which are {straight[r, t]:.3g} m apart; "
+            "give positions in metres"
         )
     _check_vertices(paths, name, length)
     _check_line_of_sight(paths, name, length, straight[..., None], paths.a if opposite is None else opposite)

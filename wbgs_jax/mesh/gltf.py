@@ -9,6 +9,7 @@ import base64
 import json
 import struct
 import urllib.parse
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,7 @@ class _File:
             text, self.binary = _chunks(content)
         self.document = json.loads(text.decode("utf-8-sig"))
         self.buffers: dict[int, bytes] = {}
+        self.seen: set[int] = set()
 
     def of(self, kind: str, number: int) -> dict[str, Any]:
         """Returns an entry of the document.
@@ -139,6 +141,14 @@ def read_gltf(file: Path) -> list[Body]:
     bodies: list[Body] = []
     for number in roots:
         _node(opened, number, np.eye(4), bodies, 0)
+    nodes = enumerate(document.get("nodes", []))
+    others = [str(node.get("name") or f"node_{i}") for i, node in nodes if "mesh" in node and i not in opened.seen]
+    if others:
+        warnings.warn(
+            f"{file}: objects outside of its scene are left out: {', '.join(others[:8])}; export a single scene "
+            "if they belong to it",
+            stacklevel=2,
+        )
     return joined(bodies)
 
 
@@ -156,6 +166,7 @@ def _node(opened: _File, number: int, above: Float[np.ndarray, "4 4"], bodies: l
     node = opened.of("nodes", number)
     if depth > 200:
         raise ValueError("its nodes form a cycle")
+    opened.seen.add(number)
     placed = above @ _matrix(node)
     if "mesh" in node:
         mesh = opened.of("meshes", int(node["mesh"]))
