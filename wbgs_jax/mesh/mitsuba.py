@@ -3,7 +3,6 @@
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from pathlib import Path, PureWindowsPath
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -14,6 +13,11 @@ from wbgs_jax.mesh.bodies import Body, RadioMaterial, joined
 from wbgs_jax.mesh.ply import read_mesh
 from wbgs_jax.mesh.wavefront import read_obj
 
+RADIO = (
+    *("relative_permittivity", "conductivity", "thickness", "color"),
+    *("scattering_coefficient", "xpd_coefficient", "scattering_pattern", "alpha_r", "alpha_i", "lambda_"),
+)
+"""Properties of a radio-material of Sionna RT; scattering and colour do not matter here."""
 SECTIONS = 64
 """Number of segments that approximate a circle."""
 
@@ -28,7 +32,7 @@ def read_mitsuba(file: Path) -> list[Body]:
     _fill_in(root, file)
     if root.find(".//include") is not None:
         raise UserError(f"{file} includes other files; export it in one")
-    materials = {bsdf.get("id"): _material(bsdf) for bsdf in root.findall("bsdf")}
+    materials = {bsdf.get("id"): _material(bsdf, file) for bsdf in root.findall("bsdf")}
     shapes = [shape for shape in root.iter("shape") if shape.get("type") != "merge"]
     return [_body(shape, number, materials, file) for number, shape in enumerate(shapes, 1)]
 
@@ -62,7 +66,8 @@ def _body(shape: ET.Element, number: int, materials: dict[str | None, RadioMater
     matrix = _transform(moved, name, file)
     vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
     named = [materials.get(reference.get("id")) for reference in shape.findall("ref")]
-    found = [material for material in [*named, *map(_material, shape.findall("bsdf"))] if material]
+    own = [_material(bsdf, file) for bsdf in shape.findall("bsdf")]
+    found = [material for material in [*named, *own] if material]
     return Body(name, vertices, faces, found[0] if found else None)
 
 
@@ -126,8 +131,12 @@ BUILT_IN: dict[str, Callable[[ET.Element], trimesh.Trimesh]] = {
 
 
 def _value(shape: ET.Element, name: str, missing: float) -> float:
-    found = shape.find(f"float[@name='{name}']")
+    found = _number(shape, name)
     return missing if found is None else float(found.get("value", missing))
+
+
+def _number(element: ET.Element, name: str) -> ET.Element | None:
+    return next((one for one in element if one.tag in ("float", "integer") and one.get("name") == name), None)
 
 
 def _point(shape: ET.Element, name: str, missing: tuple[float, float, float]) -> Float[np.ndarray, "3"]:
@@ -165,19 +174,19 @@ def _numbers(text: str) -> list[float]:
     return [float(word) for word in text.replace(",", " ").split()]
 
 
-def _material(bsdf: ET.Element) -> RadioMaterial | None:
+def _material(bsdf: ET.Element, file: Path) -> RadioMaterial | None:
     """Returns the material of a bsdf as Sionna RT interprets it; None if it describes only the appearance."""
-
-    def value(kind: str, name: str, missing: float | str) -> Any:
-        found = bsdf.find(f"{kind}[@name='{name}']")
-        return missing if found is None else type(missing)(found.get("value", missing))
-
     name = (bsdf.get("id") or "").removeprefix("mat-")
     usual = 0.1  # metres: Sionna RT's default
-    thickness = value("float", "thickness", usual)
+    thickness = _value(bsdf, "thickness", usual)
     if bsdf.get("type") == "itu-radio-material" or name.startswith(("itu_", "itu-")):
-        return RadioMaterial(value("string", "type", name[4:]), thickness)
+        kind = bsdf.find("string[@name='type']")
+        return RadioMaterial(name[4:] if kind is None else kind.get("value", name[4:]), thickness)
     if bsdf.get("type") == "radio-material":
-        properties = value("float", "relative_permittivity", 1.0), value("float", "conductivity", 0.0)
+        if unknown := [key for one in bsdf if (key := one.get("name")) is not None and key not in RADIO]:
+            raise UserError(
+                f"material {name!r} of {file} has the unknown property {unknown[0]!r}; it may have {', '.join(RADIO)}"
+            )
+        properties = _value(bsdf, "relative_permittivity", 1.0), _value(bsdf, "conductivity", 0.0)
         return RadioMaterial(name, thickness, properties)
     return None
