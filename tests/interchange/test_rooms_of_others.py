@@ -66,6 +66,23 @@ def test_obj_names_may_hold_signs_that_mean_something_elsewhere(tmp_path):
     assert sorted(areas.values()) == [9, 15, 18, 30]
 
 
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("o room\ng floor\nf 1 2 3\ng wall\nf 1 2 4\n", ["floor", "wall"]),
+        ("o room\nusemtl wood\nf 1 2 3\nusemtl glass\nf 1 2 4\n", ["glass", "wood"]),
+        ("g all\nusemtl wood\nf 1 2 3\nusemtl glass\nf 1 2 4\nusemtl wood\nf 1 3 4\n", ["glass", "wood"]),
+        ("o floor\ng a\nf 1 2 3\no wall\ng b\nf 1 2 4\ng c\nf 1 3 4\n", ["floor", "wall"]),
+        ("g floor\nf 1 2 3\ng desk\nf 1 3 4\no wall\nf 1 2 4\n", ["desk", "floor", "wall"]),
+        ("g default\no room\nusemtl a\nf 1 2 3\nf 1 2 4\n", ["room"]),
+        ("usemtl wood\nf 1 2 3\n", ["a"]),
+    ],
+)
+def test_obj_is_divided_by_objects_or_groups_or_materials(tmp_path, text, names):
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 6 0 0\nv 6 5 0\nv 0 0 3\n" + text)
+    assert sorted(found(tmp_path / "a.obj")) == names
+
+
 def test_obj_with_curved_surfaces_is_refused(tmp_path):
     (tmp_path / "a.obj").write_text(FLOOR + "o vase\ncstype bspline\nsurf 0 1 0 1 1 2 3 4\n")
     with pytest.raises(UserError, match=r"object 'vase' .* curved surface"):
@@ -219,6 +236,16 @@ def test_gltf_with_a_skin_is_refused(tmp_path):
         read_objects(gltf.write(tmp_path / "a.gltf"))
 
 
+def test_gltf_objects_outside_of_its_scene_are_noted(tmp_path):
+    gltf = Gltf().mesh(VERTICES, FACES)
+    gltf.document["nodes"] += [{"mesh": 0, "name": "wall"}, {"mesh": 0}]
+    gltf.document["scenes"].append({"nodes": [1]})
+    with pytest.warns(
+        UserWarning, match=r"a\.gltf: objects outside of its scene are left out: wall, node_2; export a single scene"
+    ):
+        assert list(found(gltf.write(tmp_path / "a.gltf"))) == ["cabinet"]
+
+
 def test_gltf_against_trimesh(tmp_path, rng):
     """Nested nodes with rotations, scales and mirrors."""
     scene = trimesh.Scene()
@@ -289,6 +316,23 @@ def test_mitsuba_writes_names_and_vectors_for_ids_and_points(tmp_path):
     )
     (tmp_path / "a.xml").write_text(XML.format(ball))
     assert found(tmp_path / "a.xml") == {"ball": (pytest.approx(np.pi, rel=5e-3), (1, 2, 3))}
+
+
+def test_mitsuba_numbers_may_be_integers(tmp_path):
+    material = '<bsdf type="radio-material" id="clay">{}</bsdf>'
+    values = "".join(
+        f'<integer name="{name}" value="{value}"/>'
+        for name, value in (("relative_permittivity", 4), ("conductivity", 1), ("thickness", 2))
+    )
+    ball = '<shape type="sphere" id="ball"><integer name="radius" value="2"/><ref id="clay"/></shape>'
+    (tmp_path / "a.xml").write_text(XML.format(material.format(values) + ball))
+    (read,) = read_objects(tmp_path / "a.xml")
+    assert read.mesh.area == pytest.approx(16 * np.pi, rel=5e-3) and read.material == ("clay", 2.0, (4.0, 1.0))
+    (tmp_path / "a.xml").write_text(XML.format(material.format('<float name="eta_r" value="4"/>') + ball))
+    with pytest.raises(
+        UserError, match=r"material 'clay' of .*a\.xml has the unknown property 'eta_r'; it may have relative_p"
+    ):
+        read_objects(tmp_path / "a.xml")
 
 
 def test_mitsuba_names_that_nobody_fills_in_and_files_of_windows(tmp_path):

@@ -1,7 +1,8 @@
 """Reads objects from OBJ files (Wavefront, appendix B of the Advanced Visualizer's manual): polygons only.
 
-Corners are numbered from 1, or backwards from the newest one if negative. Objects begin with `o`; in files without it, groups
-(`g`) are objects. Text may be in any encoding: the names within a file only have to differ.
+Corners are numbered from 1, or backwards from the newest one if negative. Objects begin with `o`; if these do not divide the
+faces of a file, groups (`g`) are objects, or else materials (`usemtl`). Text may be in any encoding: the names within a file
+only have to differ.
 """
 
 import re
@@ -30,10 +31,10 @@ def read_obj(file: Path) -> list[Body]:
         UserError: curved surfaces, vertices without three coordinates, or faces with corners that do not exist.
     """
     statements = list(_statements(_text(file.read_bytes())))
-    begins = "o" if any(words[0] == "o" for words in statements) else "g"
+    begins = _divider(statements)
     vertices: list[list[float]] = []
     faces: dict[str, tuple[list[int], list[int]]] = {}
-    name = latest = file.stem
+    names, latest = {"o": "", "g": "", "usemtl": ""}, file.stem
     for number, words in enumerate(statements, 1):
         match words[0]:
             case "v":
@@ -42,12 +43,13 @@ def read_obj(file: Path) -> list[Body]:
                 vertices.append([float(word) for word in words[1:4]])
             case "f" | "fo":  # the former name
                 corners = [_corner(word, len(vertices), file) for word in words[1:]]
+                name = names[begins] or names["o"] or names["g"] or file.stem
                 own, sizes = faces.setdefault(name, ([], []))
                 own += corners
                 sizes.append(len(corners))
-            case "o" | "g" as kind:
-                latest = " ".join(words[1:]) or f"object_{number}"
-                name = latest if kind == begins else name
+            case "o" | "g" | "usemtl" as kind:
+                names[kind] = " ".join(words[1:]) or f"object_{number}"
+                latest = latest if kind == "usemtl" else names[kind]
             case "call":
                 raise UserError(f"{file} calls another file ({' '.join(words[1:])}); export it in one")
             case kind if kind in CURVED:
@@ -57,6 +59,17 @@ def read_obj(file: Path) -> list[Body]:
         Body(name, points, triangulate(points, np.array(own, int), np.array(sizes, int)))
         for name, (own, sizes) in faces.items()
     ]
+
+
+def _divider(statements: list[list[str]]) -> str:
+    """Returns the first kind of statement that divides the faces: by objects, groups or materials; "o" if none does."""
+    names, found = {"o": "", "g": "", "usemtl": ""}, set()
+    for words in statements:
+        if words[0] in names:
+            names[words[0]] = " ".join(words[1:])
+        elif words[0] in ("f", "fo"):
+            found.add(tuple(names.values()))
+    return next((kind for kind, own in zip(names, zip(*found, strict=True), strict=False) if len(set(own)) > 1), "o")
 
 
 def _corner(word: str, count: int, file: Path) -> int:
