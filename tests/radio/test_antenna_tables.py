@@ -189,6 +189,32 @@ def test_an_msi_file_adds_the_attenuations_of_its_cuts(tmp_path, gain, dbi):
     np.testing.assert_allclose(along, np.linalg.norm(found, axis=-1), rtol=1e-5)  # vertically polarised
 
 
+@pytest.mark.parametrize(
+    ("line", "degrees"),
+    [("V", 0), ("vertical", 0), ("H", 90), ("HORIZONTAL", 90), ("+45", 45), ("-45", -45), ("DUAL SLANT 45", None)],
+)
+def test_an_msi_file_has_the_polarisation_that_it_names(tmp_path, line, degrees, recwarn):
+    (tmp_path / "a.msi").write_text(msi().replace("NAME x", f"NAME x\nPOLARIZATION {line}"))
+    (tmp_path / "b.msi").write_text(msi())
+    k = angles_to_direction(jnp.array([0.1, -0.4]), jnp.array([1.7, 1.6]))
+    own, upright = (np.asarray(read_antenna(tmp_path / f"{name}.msi").field(k)) for name in "ab")
+    angle = np.radians(degrees or 0)
+    expected = np.cos(angle) * upright + np.sin(angle) * np.cross(np.asarray(k), upright)
+    np.testing.assert_allclose(own, expected, atol=1e-5 * np.abs(upright).max())
+    notes = [str(note.message) for note in recwarn]
+    assert len(notes) == (degrees is None) and all(
+        "a.msi: the polarisation 'DUAL SLANT 45' is taken to be" in note for note in notes
+    )
+
+
+def test_columns_that_describe_an_antenna_only_in_other_programs(tmp_path):
+    """A frequency and a running number are no part of the pattern."""
+    rows = table(lambda a, z: 2).splitlines()
+    numbered = [f"{number},{row},{28}" for number, row in enumerate(rows[1:])]
+    (tmp_path / "a.csv").write_text("\n".join([f",{rows[0]},frequency_ghz", *numbered]))
+    assert read_antenna(tmp_path / "a.csv")
+
+
 def table(gain, azimuths=range(0, 360, 30)):
     rows = [f"{a},{z},{gain(a, z)}" for z in range(0, 181, 30) for a in azimuths]
     return "\n".join(["azimuth_deg,zenith_deg,gain_dbi", *rows])
@@ -214,6 +240,9 @@ def test_repeated_directions_have_one_value(tmp_path):
     [
         ("a.txt", "", "does not end in"),
         ("a.csv", "azimuth_deg,gain_dbi\n", "no column zenith_deg"),
+        ("a.csv", "azimuth_deg,zenith_deg,gain_dbi,gain_phi_dbi\n", "column 'gain_phi_dbi', which is not read beside gain_dbi"),
+        ("a.csv", "azimuth_deg,zenith_deg,gain_dbi,phase_rad\n", "column 'phase_rad', which"),
+        ("a.csv", "azimuth_deg,zenith_deg,gain_dbi,theta_re,theta_im,phi_re,phi_im\n", "column 'theta_re', which is not read"),
         ("a.csv", "azimuth_deg,zenith_deg,gain_dbi\n0,0,x\n", "line 2"),
         ("a.csv", "azimuth_deg,zenith_deg,gain_dbi\n0,0,1\n90,90,1\n", "no regular grid"),
         ("a.csv", "azimuth_deg,zenith_deg,gain_dbi\n0,0,-3,5\n", "line 2 of .* has 4 cells, but the header has 3"),

@@ -6,9 +6,12 @@ integrates to 4 pi; losses belong to the transmitted power. A file without polar
 antenna.
 """
 
+import dataclasses
 import re
+import warnings
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Inexact
 
@@ -29,8 +32,9 @@ def read_antenna(path: Path) -> Antenna:
 
             * CSV: columns `azimuth_deg`, `zenith_deg` or `elevation_deg`, and `gain_dbi` with an optional `phase_deg`, or the
               four `theta_re`, `theta_im`, `phi_re` and `phi_im`; every direction of a regular grid over the sphere.
-            * MSI Planet: `GAIN` (dBd, or dBi if the line says so) and the cuts `HORIZONTAL 360` and `VERTICAL 360`, whose
-              attenuations (dB) are added in every direction. Its azimuths are clockwise, its elevations positive downwards.
+            * MSI Planet: `GAIN` (dBd, or dBi if the line says so), `POLARIZATION` (V, H, +45 or -45) and the cuts
+              `HORIZONTAL 360` and `VERTICAL 360`, whose attenuations (dB) are added in every direction. Its azimuths are
+              clockwise, its elevations positive downwards.
             * NumPy archive: complex `e_theta` and `e_phi` (zenith, azimuth), and the angles `zenith` and `azimuth` in radians.
 
     Returns:
@@ -50,13 +54,20 @@ def _read_csv(path: Path) -> Antenna:
     vertical = next((name for name in ("zenith_deg", "elevation_deg", "elevation") if name in names), "zenith_deg")
     components = ("theta_re", "theta_im", "phi_re", "phi_im")  # columns of a CSV file with fields instead of gains
     values = ("gain_dbi",) if "gain_dbi" in names else components
+    phase = ("phase_deg",) if "gain_dbi" in names else ()
+    known = {"", "azimuth_deg", "zenith_deg", "elevation_deg", "elevation", *values, *phase}
+    if unknown := [name for name in names if name not in known and not name.startswith("frequency")]:
+        raise UserError(
+            f"{path} has the column {unknown[0]!r}, which is not read beside {values[0]}; remove it, or give azimuth_deg, "
+            f"zenith_deg, and either gain_dbi with an optional phase_deg, or {', '.join(components)}"
+        )
     needed = ("azimuth_deg", vertical, *values)
     if missing := [name for name in needed if name not in names]:
         raise UserError(
             f"{path} has no column {', '.join(missing)}; its first line must name azimuth_deg, zenith_deg and gain_dbi, or "
             f"{', '.join(components)} instead of the gain"
         )
-    optional = ("phase_deg",) if "phase_deg" in names and "gain_dbi" in names else ()
+    optional = tuple(name for name in phase if name in names)
     columns = [names.index(name) for name in (*needed, *optional)]
     table = []
     most_rows = 1_000_000  # largest number of directions: finer than half a degree
@@ -113,7 +124,16 @@ def _read_msi(path: Path) -> Antenna:
     _check_decibels(path, np.concatenate([gain - horizontal, gain - vertical]))
     zenith, azimuth = np.arange(181), np.arange(CUT)
     attenuation = vertical[(zenith[:, None] - 90) % CUT] + horizontal[-azimuth % CUT]
-    return tabulated(10 ** ((gain - attenuation) / 20), None)
+    antenna = tabulated(10 ** ((gain - attenuation) / 20), None)
+    polarisation = " ".join(head.get("POLARIZATION", ["V"])).upper()
+    slants = {"V": 0, "VERTICAL": 0, "H": 90, "HORIZONTAL": 90, "+45": 45, "-45": -45}  # degrees
+    if polarisation not in slants:
+        warnings.warn(
+            f"{path}: the polarisation {polarisation!r} is taken to be vertical; write that of one port: V, H, +45 or -45",
+            stacklevel=2,
+        )
+    slant = np.float32(np.radians(slants.get(polarisation, 0)))
+    return dataclasses.replace(antenna, slant=jnp.asarray(slant)) if slant else antenna
 
 
 def _cut(lines: list[list[str]], name: str) -> Float[np.ndarray, "360"]:
