@@ -1,10 +1,12 @@
 """`wbgs-jax convert`: a run's Gaussians and paths for other programs, and paths of theirs as a scene that trains."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 from builders.commands import assert_error_for_people, call
-from builders.drawn_paths import bounced_paths
+from builders.drawn_paths import angles_of, bounced_paths
 from builders.untrained import make_coherent_run, make_run
 from scipy.io import savemat
 
@@ -13,7 +15,7 @@ from wbgs_jax.data.load import load_dataset
 from wbgs_jax.data.scene_file import load_room
 from wbgs_jax.interchange.deepmimo import read_deepmimo
 from wbgs_jax.interchange.gaussian_ply import read_gaussians
-from wbgs_jax.interchange.ray_paths import load_paths
+from wbgs_jax.interchange.ray_paths import load_paths, save_paths
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +71,36 @@ def test_arrays_of_sionna_in_files_of_any_kind(tmp_path, suffix):
         convert("--paths", file, "--array", "2x2", "--out", tmp_path / f"{file.stem}_scene.npz")
     one, other = (load_dataset(tmp_path / f"{name}_scene.npz") for name in ("plain", "paths"))
     np.testing.assert_array_equal(one.snapshots, other.snapshots)
+
+
+def test_a_room_on_its_side_is_refused_beside_antennas(tmp_path):
+    """Rooms of 12 x 14 x 3 m with the antennas up to 2.5 m high; the model is y up but in a format that is usually z up."""
+    paths = bounced_paths(np.random.default_rng(0), transmitters=6, direct=True)
+    low = {name: getattr(paths, name) * [1, 1, 0.25] for name in ("sources", "targets")}
+    length = np.linalg.norm(low["targets"][:, None] - low["sources"][None], axis=-1)
+    offset = (low["targets"][:, None] - low["sources"][None]) / length[..., None]
+    away, towards = (angles_of(ends[:, :, None]) for ends in (offset, -offset))
+    direct = replace(
+        paths, **low, a=paths.a[..., :1], tau=length[..., None] / 299792458, theta_t=away[0], phi_t=away[1],
+        theta_r=towards[0], phi_r=towards[1], interactions=paths.interactions[:0, ..., :1],
+        vertices=paths.vertices[:0, ..., :1, :], valid=paths.valid[..., :1]
+    )  # fmt: skip
+    save_paths(tmp_path / "paths.npz", direct)
+    room = trimesh.creation.box(bounds=[[-1, -2, 0], [11, 12, 3]])
+    room.export(tmp_path / "upright.obj")
+    room.apply_transform([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]).export(tmp_path / "turned.obj")
+    convert(tmp_path / "turned.obj", "--out", tmp_path / "turned.npz")
+    given = "--paths", tmp_path / "paths.npz", "--out", tmp_path / "scene.npz", "--mesh"
+    refused = call(convert_command.main, *given, tmp_path / "turned.obj")
+    assert_error_for_people(refused, "turned.obj lies on its side", "100% once it is upright; give --up y or --up z")
+    refused = call(convert_command.main, *given, tmp_path / "turned.npz")
+    assert_error_for_people(refused, "convert its model again with --up y or --up z")
+    assert_error_for_people(call(convert_command.main, *given, tmp_path / "turned.npz", "--up", "y"), "--up has no effect on")
+    assert_error_for_people(call(convert_command.main, *given[:4], "--up", "y"), "--up has no effect on paths alone")
+    convert(*given, tmp_path / "upright.obj")
+    upright = load_room(tmp_path / "scene.npz").vertices
+    convert(*given, tmp_path / "turned.obj", "--up", "y")
+    np.testing.assert_allclose(np.sort(load_room(tmp_path / "scene.npz").vertices, 0), np.sort(upright, 0), atol=1e-5)
 
 
 def test_files_without_arrays_are_read_before_a_frequency_is_asked_for(tmp_path):

@@ -32,7 +32,8 @@ from wbgs_jax.inference.queries import parse_array, parse_grid
 
 RUN, MODEL, SIONNA, DEEPMIMO = "--run", "a model", "paths of Sionna RT", "paths of DeepMIMO"
 KINDS = {
-    **dict.fromkeys(("materials", "up", "scale"), (MODEL,)),
+    **dict.fromkeys(("materials", "scale"), (MODEL,)),
+    "up": (MODEL, SIONNA, DEEPMIMO),
     **dict.fromkeys(("tx", "grid", "rx"), (RUN,)),
     "ghz": (RUN, SIONNA, DEEPMIMO),
     **dict.fromkeys(("array", "mesh", "swap"), (SIONNA, DEEPMIMO)),
@@ -59,7 +60,7 @@ class Command:
     materials: Path | None = None
     """Model: a .toml file with the materials of its objects (docs/own_scene.md)."""
     up: Literal["y", "z"] | None = None
-    """Model: the axis that points upwards; by default y for .glb and .gltf, z for others."""
+    """Model, also of --mesh: the axis that points upwards; by default y for .glb and .gltf, z for others."""
     scale: float | None = None
     """Model: length of its unit in metres."""
     tx: tuple[str, ...] = ()
@@ -102,6 +103,8 @@ def check(command: Command) -> None:
         )
     kinds = (RUN,) if command.folder else (MODEL,) if command.model else (SIONNA, DEEPMIMO)
     check_effects(command, KINDS, kinds, " or ".join(kinds))
+    if command.paths and command.up and command.mesh is None:
+        raise UserError("--up has no effect on paths alone; it belongs to the model, --mesh room.glb")
     if command.folder is None and command.out.suffix != ".npz":
         raise UserError(f"--out {command.out} does not end in .npz, as scene files and room files must")
     if command.folder is None:
@@ -169,7 +172,7 @@ def take_in(command: Command) -> str:
     from wbgs_jax.data.scene_file import save_scene
     from wbgs_jax.interchange.deepmimo import is_deepmimo, load_deepmimo
     from wbgs_jax.interchange.ray_paths import check_paths, read_paths
-    from wbgs_jax.interchange.rooms import open_room
+    from wbgs_jax.interchange.rooms import check_upright, open_room
     from wbgs_jax.interchange.scenes import scene_of_paths
     from wbgs_jax.interchange.sionna_arrays import DEFAULT, scene_of_sionna
     from wbgs_jax.radio.array import planar_array
@@ -184,7 +187,7 @@ def take_in(command: Command) -> str:
     of_deepmimo = is_deepmimo(command.paths)
     kind = DEEPMIMO if of_deepmimo else SIONNA
     check_effects(command, KINDS, (kind,), kind)
-    room = None if command.mesh is None else open_room(command.mesh)
+    room = None if command.mesh is None else open_room(command.mesh, command.up)
     shape, name = parse_array(command.array, "--array") if command.array else None, command.out.stem
     if of_deepmimo:
         paths = load_deepmimo(command.paths, hertz, command.tx_set, command.tx_index, command.rx_set)
@@ -194,6 +197,8 @@ def take_in(command: Command) -> str:
     else:
         choice = shape, command.port, command.tx_antenna, command.swap
         scene = scene_of_sionna(read_paths(command.paths), name, hertz, *choice, room, str(command.paths))
+    if room is not None and command.mesh is not None:
+        check_upright(command.mesh, room, np.concatenate([scene.tx_positions, scene.rx_position]))
     save_scene(command.out, scene)
     connected = int((np.abs(scene.observations["snapshots"]) > 0).any((-1, -2, -3)).sum())
     count = f"{len(scene.tx_positions)} transmitters, {connected} with paths"

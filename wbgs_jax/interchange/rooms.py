@@ -11,7 +11,7 @@ from jaxtyping import Float
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import Room, load_room
 from wbgs_jax.interchange.room_materials import Slab, slabs_of
-from wbgs_jax.mesh.importers import FileObject, read_objects
+from wbgs_jax.mesh.importers import Y_UP, FileObject, read_objects
 from wbgs_jax.mesh.walls import divided, hidden_walls, walls_as_sheets
 
 MAX_TRIANGLES = 2_000_000
@@ -84,9 +84,32 @@ def room_of(objects: Sequence[RoomObject]) -> Room:
     )
 
 
-def open_room(path: Path) -> Room:
-    """Returns the room of a room file or a scene file (.npz), or of a model in metres with unknown materials."""
-    return load_room(path) if path.suffix.lower() == ".npz" else room_of(read_room(path, named=False))
+def open_room(path: Path, up: str | None = None) -> Room:
+    """Returns the room of a room file or a scene file (.npz), or of a model in metres with unknown materials, whose axis `up`
+    points up if it is not the usual one."""
+    if path.suffix.lower() != ".npz":
+        return room_of(read_room(path, up=up, named=False))
+    if up is not None:
+        raise UserError(f"--up has no effect on the room file {path}; convert its model again, with --up")
+    return load_room(path)
+
+
+def check_upright(path: Path, room: Room, antennas: Float[np.ndarray, "n 3"]) -> None:
+    """Raises a `UserError` if most antennas (metres) are outside of the box around a room, but inside if the room is turned so
+    that the other axis, y or z, points up."""
+
+    def inside(turn: Float[np.ndarray, "3 3"]) -> float:
+        corners = room.vertices @ turn.T
+        return float(((antennas >= corners.min(0)) & (antennas <= corners.max(0))).all(1).mean())
+
+    few, many = 0.6, 0.9  # shares of antennas inside
+    turn = Y_UP[:3, :3]
+    if (here := inside(np.eye(3))) < few and (turned := max(inside(turn), inside(turn.T))) > many:
+        advice = "convert its model again with" if path.suffix.lower() == ".npz" else "give"
+        raise UserError(
+            f"{path} lies on its side: {here:.0%} of the antennas are inside of its box, but {turned:.0%} once it is upright; "
+            f"{advice} --up y or --up z, the axis of the model that points up"
+        )
 
 
 def describe_room(objects: Sequence[RoomObject], sorts: Sequence[str]) -> str:
