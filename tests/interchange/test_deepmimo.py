@@ -140,7 +140,9 @@ def test_phases_of_the_opposite_sign_are_refused_and_others_noted(rng):
     for otherwise in (True, False):
         with pytest.raises(UserError, match="lines of sight grow with their delays; give the opposite sign"):
             from_deepmimo(arrays | {"phase": -arrays["phase"]}, 3.5e9, otherwise)
-        with pytest.warns(UserWarning, match=f"neither agree nor follow .* {'in' if otherwise else 'ex'}clude the propagation"):
+        with pytest.warns(
+            UserWarning, match=f"neither agree nor follow .* {'include' if otherwise else 'exclude'} the propagation"
+        ):
             from_deepmimo(arrays, 3.4e9, otherwise)
 
 
