@@ -37,6 +37,13 @@ def test_the_published_layout_of_gateways(tmp_path, rng):
     assert np.isnan(readings.powers[3, 1]) and np.isfinite(readings.powers).sum() == 59
 
 
+def test_weak_readings_of_gateways_are_readings(tmp_path):
+    (tmp_path / "tx_pos.csv").write_text("x,y,z\n" + "".join(f"{k},1,1\n" for k in range(4)))
+    (tmp_path / "gateway_position.yml").write_text("gateway1: [0, 0, 2]\n")
+    (tmp_path / "gateway_rssi.csv").write_text("gateway1\n-97\n-100\n-104.5\n-111\n")
+    np.testing.assert_array_equal(load_readings(tmp_path, HEIGHT).powers[:, 0], [-97, np.nan, -104.5, -111])
+
+
 @pytest.mark.parametrize("style", ["antennas of one station", "receivers by name"])
 def test_the_published_layout_of_channel_state(style, tmp_path, rng):
     """Its power is the mean over subcarriers, in decibels; an antenna that heard nothing says nothing."""
@@ -191,6 +198,47 @@ def test_receivers_keep_their_ids(tmp_path, rng):
     readings = tmp_path / "readings.csv"
     readings.write_text(readings.read_text().replace("rssi_3", "c").replace("rssi_1", "a").replace("rssi_2", "b"))
     assert cell_means(load_readings(tmp_path, HEIGHT), 0.5).titles == ["receiver 1 (a)", "receiver 2 (b)", "receiver 3 (c)"]
+
+
+@pytest.mark.parametrize("column", ["receiver_id", "ap_id", "anchor_id", "ssid", "label", "number", "rx", "", "Sensor"])
+def test_a_column_of_ids_has_any_name(tmp_path, rng, column):
+    """Rows in another order than the columns of powers."""
+    folder(tmp_path, rng, n=20, noise=0.0)
+    _, *rows = (tmp_path / "receivers.csv").read_text().splitlines()
+    (tmp_path / "receivers.csv").write_text("\n".join([f"{column},x,y,z", *rows[::-1]]))
+    readings = load_readings(tmp_path, HEIGHT)
+    np.testing.assert_allclose(readings.receivers, RECEIVERS[::-1])
+    heard = np.isfinite(readings.powers)
+    np.testing.assert_allclose(readings.powers[heard], powers(readings.places)[:, ::-1][heard], atol=0.01)
+    assert readings.ids == ("3", "2", "1")
+
+
+@pytest.mark.parametrize(
+    ("column", "cells", "says"),
+    [
+        ("unit", ["ft"] * 3, r"columns of unknown meaning \('unit'\); remove them, and"),
+        ("offset_db", ["1.5", "2", "-3"], "'offset_db'"),
+        ("Floor", ["1", "2", "3"], r"\('floor'\); remove them \(heights are in z\), and name"),
+        ("", ["7", "8", "9"], "unknown meaning"),
+        ("", ["0", "1", "2"], None),  # as pandas counts rows
+        ("comment", ["new", "", "old"], None),
+        ("mac", ["a", "b", "c"], None),
+    ],
+)
+@pytest.mark.parametrize("with_ids", [True, False])
+def test_other_columns_of_receivers_are_refused_unless_they_say_nothing(tmp_path, rng, column, cells, says, with_ids):
+    folder(tmp_path, rng, n=20, noise=0.0)
+    first = load_readings(tmp_path, HEIGHT)
+    lines = (tmp_path / "receivers.csv").read_text().splitlines()
+    lines = [line if with_ids else line.split(",", 1)[1] for line in lines]
+    (tmp_path / "receivers.csv").write_text(
+        "\n".join(f"{cell},{line}" for cell, line in zip([column, *cells], lines, strict=True))
+    )
+    if says is None and (with_ids or column != "mac"):
+        np.testing.assert_array_equal(load_readings(tmp_path, HEIGHT).powers, first.powers)
+    else:
+        with pytest.raises(UserError, match=says or "do not each name one of the receivers"):
+            load_readings(tmp_path, HEIGHT)
 
 
 def test_columns_end_in_ids_that_hold_underscores(tmp_path, rng):

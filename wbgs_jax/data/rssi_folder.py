@@ -47,6 +47,8 @@ from wbgs_jax.data.tables import (
 )
 
 RSSI, CSI = "gateway_rssi.csv", "csidata.npy"
+FLOORS = ("floor", "storey", "level")
+"""Names of columns of floors."""
 TRANSMITTERS, GATEWAYS = ("tx_pos.csv",), ("gateway_position.yml",)
 
 Powers = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n r"], Float[np.ndarray, "r 3"]]
@@ -93,7 +95,7 @@ def _rssi(path: Path, gateways: list[str] | int) -> Float[np.ndarray, "n r"]:
     if len(header) != count:
         raise UserError(f"{path} has powers of {len(header)} gateways, but {GATEWAYS[0]} has {count}")
     values = numbers(path, header, rows, match_columns(path, header, gateways))
-    values = not_received(path, np.where(values <= -100.0, np.nan, values))  # -100: not received
+    values = not_received(path, np.where(values == -100.0, np.nan, values))  # -100: not received
     check_powers(path, values)
     return values
 
@@ -198,21 +200,18 @@ def _load_tables(folder: Path, height: float) -> Readings:
     # Names of columns that are ignored.
     ignored = ("time", "timestamp", "date", "datetime", "comment", "note", "device", "index")
     # Names of columns that divide readings; those of floors require heights.
-    room_columns = ("room", "floor", "storey", "level")
+    room_columns = ("room", *FLOORS)
     powers = [name for name in header if name not in ("x", "y", "z", *room_columns, *ignored)]
     if len(powers) != len(receivers):
         raise UserError(
             f"{path} has {len(powers)} columns of powers ({', '.join(powers)}), {of_receivers} has {len(receivers)} receivers; "
             "name these columns by the ids of receivers, and remove columns that are not powers"
         )
-    # Names of columns that may identify a receiver.
-    identifiers = ("id", "name", "receiver", "gateway", "anchor", "ap", "mac", "bssid")
-    ids = next((names.index(name) for name in identifiers if name in names), None)
-    named = () if ids is None else tuple(entry[ids] for entry in entries)
+    named = _ids(of_receivers, names, entries, powers)
     powers = match_columns(path, powers, list(named) or len(receivers))
     places = numbers(path, header, rows, ["x", "y", "z"] if "z" in header else ["x", "y"])
     parts = [header.index(name) for name in room_columns if name in header]
-    if places.shape[1] == 2 and set(room_columns[1:]) & set(header):
+    if places.shape[1] == 2 and set(FLOORS) & set(header):
         raise UserError(f"{path} has a column of floors but no heights; add the column z, metres in the receivers' frame")
     if places.shape[1] == 2:
         places = np.column_stack([places, np.full(len(places), height)])
@@ -220,6 +219,45 @@ def _load_tables(folder: Path, height: float) -> Readings:
     values = not_received(path, numbers(path, header, rows, powers))
     check_powers(path, values)
     return Readings(places, values, np.isfinite(values).astype(float), rooms, receivers, named)
+
+
+def _ids(path: Path, header: list[str], rows: list[list[str]], powers: list[str]) -> tuple[str, ...]:
+    """Returns the ids of receivers; empty if no column holds them.
+
+    Args:
+        path: of the receivers, for messages.
+        header: names of its columns.
+        rows: its cells.
+        powers: columns of powers; those of a single column of unknown name that match them are ids.
+
+    Raises:
+        UserError: there are other columns of unknown meaning.
+    """
+    columns = dict(zip(header, zip(*rows, strict=True), strict=True))
+    identifiers = ("id", "name", "receiver", "gateway", "anchor", "ap", "mac", "bssid")  # names of columns of ids, ...
+    identifiers += (*(f"{name}_id" for name in identifiers[2:6]), "rx", "label", "number", "ssid")
+    # ... of columns that are ignored, and of those in which pandas counts rows.
+    ignored = ("comment", "comments", "note", "notes", "description", "room", "location", "device", "model", "date")
+    counted = [name for name in ("", "index", "unnamed: 0") if columns.get(name) == tuple(map(str, range(len(rows))))]
+    others = [name for name in header if name not in ("x", "y", "z", *identifiers, *ignored, *counted)]
+    known = [name for name in identifiers if name in header]
+    candidates = known + (others if len(others) == 1 and others[0] not in FLOORS else [])
+    ids = next((name for name in candidates if _match(path, powers, columns[name])), next(iter(known), None))
+    if unknown := [name for name in others if name != ids]:
+        heights = " (heights are in z)" * bool(set(unknown) & set(FLOORS))
+        raise UserError(
+            f"{path} has columns of unknown meaning ({', '.join(map(repr, unknown))}); remove them{heights}, and name a "
+            "column of ids 'id', or of remarks 'comment'"
+        )
+    return () if ids is None else columns[ids]
+
+
+def _match(path: Path, columns: list[str], ids: tuple[str, ...]) -> bool:
+    """Returns whether columns can be matched with receivers."""
+    try:
+        return bool(match_columns(path, columns, ids))
+    except UserError:
+        return False
 
 
 def _checked(readings: Readings, folder: Path) -> Readings:
