@@ -415,6 +415,36 @@ def test_floors_part_readings_as_rooms_do(tmp_path):
     np.testing.assert_array_equal(readings.powers[:2], [[-60, -50], [-80, -70]])
 
 
+def test_floors_at_the_same_height_are_refused(tmp_path):
+    """Heights from each floor, as z = 1.2 on all of them; floors a storey apart are read."""
+    (tmp_path / "receivers.csv").write_text("id,x,y,z\n1,0,0,2\n")
+    for rise, refused in ((3.0, False), (0.2, True), (0.0, True)):
+        rows = [f"{x},1,{1.2 + rise * floor:g},{floor},-{50 + x}" for floor in (2, 0, 1) for x in range(5)]
+        (tmp_path / "readings.csv").write_text("\n".join(["x,y,z,storey,1", "3,3,1.2,,-50", *rows]))
+        if refused:
+            with pytest.raises(
+                UserError, match=r"storeys '\d' and '\d' at the same .*; z must count from one origin, not from"
+            ):
+                load_readings(tmp_path, HEIGHT)
+        else:
+            assert len(load_readings(tmp_path, HEIGHT).places) == 16
+
+
+def test_readings_in_centimetres_are_noted(tmp_path, rng):
+    """Of a flat of 8 m x 4 m."""
+    folder(tmp_path, rng, n=30, rooms=False)
+    (tmp_path / "walls.csv").unlink()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_survey(tmp_path)
+    for file, skip in (("readings.csv", 0), ("receivers.csv", 1)):
+        header, *rows = [line.split(",") for line in (tmp_path / file).read_text().splitlines()]
+        scaled = [[*row[:skip], *(str(100 * float(cell)) for cell in row[skip : skip + 2]), *row[skip + 2 :]] for row in rows]
+        write_table(tmp_path / file, header, scaled)
+    with pytest.warns(UserWarning, match="neighbouring places are .* m apart: are these metres"):
+        load_survey(tmp_path)
+
+
 def test_gateways_are_found_by_their_names(tmp_path):
     (tmp_path / "tx_pos.csv").write_text("x,y,z\n1,1,1\n2,2,1\n")
     (tmp_path / "gateway_position.yml").write_text("gateway1: [0, 0, 2]\ngateway2: [9, 0, 2]\ngateway3: [5, 5, 2]\n")

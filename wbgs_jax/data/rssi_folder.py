@@ -23,6 +23,7 @@ Channel state is reduced to its mean power over the subcarriers, in dB relative 
 """
 
 import dataclasses
+import itertools
 import re
 import warnings
 from dataclasses import dataclass
@@ -213,12 +214,27 @@ def _load_tables(folder: Path, height: float) -> Readings:
     parts = [header.index(name) for name in room_columns if name in header]
     if places.shape[1] == 2 and set(FLOORS) & set(header):
         raise UserError(f"{path} has a column of floors but no heights; add the column z, metres in the receivers' frame")
+    for name in (column for column in FLOORS if column in header):
+        _check_floors(path, name, [row[header.index(name)] for row in rows], places[:, 2])
     if places.shape[1] == 2:
         places = np.column_stack([places, np.full(len(places), height)])
     rooms = tuple("/".join(row[part] for part in parts if row[part]) for row in rows)
     values = not_received(path, numbers(path, header, rows, powers))
     check_powers(path, values)
     return Readings(places, values, np.isfinite(values).astype(float), rooms, receivers, named)
+
+
+def _check_floors(path: Path, column: str, floors: list[str], heights: Float[np.ndarray, " n"]) -> None:
+    """Raises a `UserError` if two floors are at one height (metres)."""
+    storey = 1.0  # metres: smallest difference of the heights of two floors
+    of_floor = {floor: float(np.median(heights[np.array(floors) == floor])) for floor in dict.fromkeys(floors) if floor}
+    ordered = sorted(of_floor, key=lambda floor: of_floor[floor])
+    for low, high in itertools.pairwise(ordered):
+        if of_floor[high] - of_floor[low] < storey:
+            raise UserError(
+                f"{path} has the {column}s {low!r} and {high!r} at the same height (z = {of_floor[low]:g} and "
+                f"{of_floor[high]:g}); z must count from one origin, not from each floor (use 'room' for parts of one floor)"
+            )
 
 
 def _ids(path: Path, header: list[str], rows: list[list[str]], powers: list[str]) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.floor_plan import FILES, NO_WALLS, Walls, load_walls
@@ -81,6 +82,7 @@ def load_survey(folder: Path, height_m: float = HEIGHT_M, cell_m: float = CELL_M
             "the readings by storey or by part of the building"
         )
     cells = cell_means(readings, cell_m)
+    _note_spacing(folder, cells.places, cell_m)
     while len(cells.places) > MAX_PLACES:
         cell_m *= 2
         cells = cell_means(readings, cell_m, STOREY_M)
@@ -95,6 +97,18 @@ def load_survey(folder: Path, height_m: float = HEIGHT_M, cell_m: float = CELL_M
             stacklevel=2,
         )
     return Survey(cells, cell_m, walls)
+
+
+def _note_spacing(folder: Path, places: Float[np.ndarray, "n 3"], cell_m: float) -> None:
+    """Warns of places so far from each other that they are probably not in metres."""
+    far = max(20.0, 50 * cell_m)  # metres: median distance of neighbouring places that is noted
+    apart = float(np.median(cKDTree(places).query(places, 2)[0][:, 1]))
+    if far < apart < np.inf:
+        warnings.warn(
+            f"{folder}: neighbouring places are {apart:.3g} m apart: are these metres? Otherwise convert the positions of "
+            "readings, receivers and walls",
+            stacklevel=3,
+        )
 
 
 def _check_plan(what: str, walls: Walls, cells: Readings) -> None:
