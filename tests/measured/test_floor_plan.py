@@ -61,6 +61,33 @@ def test_outlines_of_several_rooms_are_told_apart(tmp_path):
     np.testing.assert_array_equal(crossings(walls, start, goal), [0, 1, 0])
 
 
+ROOMS = [[f"{x},{y}" for x, y in ((left, 0), (left + 4, 0), (left + 4, 5), (left, 5))] for left in (0, 4.2)]
+
+
+@pytest.mark.parametrize("between", ["\n\n", "\n,\n", "\r\n\r\n\r\n"])
+@pytest.mark.parametrize("closed", [False, True])
+def test_empty_lines_and_repeated_corners_separate_outlines(tmp_path, between, closed):
+    outlines = ["\n".join([*room, *room[:closed]]) for room in ROOMS]
+    for text in (between.join(outlines), "\n".join(outlines) if closed else between.join(outlines)):
+        (tmp_path / "walls.csv").write_text(f"x,y\n{text}\n\n")
+        corners = np.array([[row.split(",") for row in room] for room in ROOMS], float)
+        expected = np.concatenate([np.stack([room, np.roll(room, -1, 0)], 1) for room in corners])
+        np.testing.assert_array_equal(load_walls(tmp_path / "walls.csv").ends, expected)
+
+
+def test_empty_lines_after_all_corners_separate_nothing(tmp_path):
+    (tmp_path / "walls.csv").write_bytes("\r\r\n".join(["x,y", *ROOMS[0], ""]).encode())
+    assert len(np.unique(load_walls(tmp_path / "walls.csv").ends, axis=0)) == 4
+
+
+def test_corners_after_a_closed_outline_are_refused(tmp_path):
+    (tmp_path / "walls.csv").write_text("\n".join(["x,y", *ROOMS[0], ROOMS[0][0], *ROOMS[1]]))
+    with pytest.raises(
+        UserError, match=r"returns to its first corner \[0.0, 0.0\], but .*; separate the outlines by a column room"
+    ):
+        load_walls(tmp_path / "walls.csv")
+
+
 def test_walls_stand_between_floor_and_ceiling(tmp_path):
     write_table(tmp_path / "walls.csv", ["x1", "y1", "x2", "y2"], [[0, 0, 5, 0], [5, 0, 5, 3], [2, 1, 2, 1]])
     mesh = extruded(load_walls(tmp_path / "walls.csv"), 2.5)

@@ -1,9 +1,11 @@
 """Walls of a floor plan: the number of walls between two points, and a mesh of the walls.
 
 walls.csv (or layout.csv) has segments x1,y1,x2,y2, one per wall, or the corners x,y of an outline of free space, in which a
-wall between rooms has two faces; a column `room` separates several outlines. Metres.
+wall between rooms has two faces. A column `room` separates several outlines, or empty lines, or the first corner of each at its
+end. Metres.
 """
 
+import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import trimesh
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
@@ -71,10 +73,41 @@ def load_walls(path: Path) -> Walls:
         )
     if form is SEGMENTS:
         return Walls(values.reshape(-1, 2, 2), np.full(len(values), form.share))
-    room = np.array([row[header.index(outline_column)] if outline_column in header else "" for row in rows])
-    outlines = [values[room == one] for one in dict.fromkeys(room.tolist())]
+    if outline_column in header:
+        room = np.array([row[header.index(outline_column)] for row in rows])
+        outlines = [values[room == one] for one in dict.fromkeys(room.tolist())]
+    else:
+        outlines = np.split(values, _gaps(path))
+    outlines = [ring for corners in outlines for ring in _rings(path, corners)]
     ends = np.concatenate([np.stack([corners, np.roll(corners, -1, 0)], 1) for corners in outlines])
     return Walls(ends, np.full(len(ends), form.share))
+
+
+def _gaps(path: Path) -> Int[np.ndarray, " g"]:
+    """Returns the rows of a CSV file that more empty lines precede than others (some programs write one after every row)."""
+    with path.open(newline="", encoding="utf-8-sig") as stream:
+        empty = np.array([not any(map(str.strip, row)) for row in csv.reader(stream)])
+    before = np.diff(np.cumsum(empty)[~empty][1:])  # every row but the header and the first
+    return 1 + np.flatnonzero(before > before.min(initial=len(empty)))
+
+
+def _rings(path: Path, corners: Float[np.ndarray, "n 2"]) -> list[Float[np.ndarray, "k 2"]]:
+    """Returns the closed outlines, each ending in its first corner, that corners consist of; all corners if there is only one.
+
+    Raises:
+        UserError: the last of several outlines is not closed.
+    """
+    rings, start = [], 0
+    for k in range(len(corners)):
+        if k - start >= 3 and (corners[k] == corners[start]).all():
+            rings.append(corners[start:k])
+            start = k + 1
+    if rings and start < len(corners):
+        raise UserError(
+            f"{path}: an outline returns to its first corner {rings[-1][0].tolist()}, but the corners after it do not "
+            "return to theirs; separate the outlines by a column room"
+        )
+    return rings or [corners]
 
 
 def namespace(array: Any) -> Any:
