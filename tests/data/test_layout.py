@@ -53,7 +53,7 @@ def scene(rng):
         rx_position=rng.normal(size=(1, 3)),
         rx_orientation=(q := rng.normal(size=(1, 4))) / np.linalg.norm(q),
         element_positions=planar_array()[None],
-        vertices=rng.normal(size=(6, 3)).astype(np.float32),
+        vertices=99 * rng.normal(size=(6, 3)).astype(np.float32),
         faces=rng.integers(0, 6, (4, 3)).astype(np.int32),
         face_part=np.zeros(4, np.int32),
         split=np.array([0, 1, 0, 0], np.int8),
@@ -152,7 +152,7 @@ def test_one_frequency_from_the_gateway_or_the_caller(folder, where):
 
 def test_a_folder_with_walls_but_no_frequency_is_doubted(folder):
     (folder / "freq.txt").unlink()
-    trimesh.creation.box().export(folder / "point_cloud.ply")
+    trimesh.creation.box((20, 20, 20)).export(folder / "point_cloud.ply")
     with pytest.warns(UserWarning, match="does not record a frequency, and 1 GHz is assumed"):
         load_layout(folder)
     with warnings.catch_warnings():
@@ -324,7 +324,7 @@ def no_images(folder):
         (truncate("point_cloud.ply"), "point_cloud.ply", "truncated"),
         (write("point_cloud.ply", ""), "point_cloud.ply", "not a PLY"),
         (scale_mesh(1000), "point_cloud.ply", "vertices contains 10000; positions are in metres"),
-        (scale_mesh(1e-3), "den", "no antenna is near the surfaces"),
+        (scale_mesh(1e-3), "den", "the transmitters are not near the surfaces"),
     ],
 )
 def test_bad_input(folder, spoil, file, trouble):

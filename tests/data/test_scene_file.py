@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import json
 import re
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -114,10 +115,37 @@ def test_a_thickness_in_millimetres_is_refused(scene):
 def test_surfaces_without_an_antenna_near_them_are_refused(scene):
     """One antenna suffices, at most the longest side of their box away."""
     surfaces = {"faces": np.array([[0, 1, 2]], np.int32), "face_part": np.zeros(1, np.int32)}
-    corner = dataclasses.replace(scene, vertices=np.float32(100 + 2 * np.eye(3)), **surfaces)
-    assert len(scene_dataset(dataclasses.replace(corner, rx_position=np.full((1, 3), 98.1)))) == 15
-    with pytest.raises(UserError, match=r"^den: no antenna is near the surfaces, .*; give both in metres, in one frame$"):
-        scene_dataset(dataclasses.replace(corner, rx_position=np.full((1, 3), 97.9)))
+    corner = dataclasses.replace(scene, vertices=np.float32(15 + 2 * np.eye(3)), **surfaces)
+    with pytest.warns(UserWarning, match="most transmitters lie outside of the surfaces"):
+        assert len(scene_dataset(dataclasses.replace(corner, rx_position=np.full((1, 3), 13.1)))) == 15
+    with pytest.raises(
+        UserError, match=r"^den: the transmitters are not near the surfaces, .*; give both in metres, in one frame$"
+    ):
+        scene_dataset(dataclasses.replace(corner, rx_position=np.full((1, 3), 12.9)))
+
+
+@pytest.mark.parametrize("antennas", ["transmitters", "receivers"])
+@pytest.mark.parametrize(("scale", "outcome"), [(1.0, None), (3.28, "noted"), (100.0, "refused")])
+def test_antennas_in_another_unit_than_the_surfaces(scene, rng, antennas, scale, outcome):
+    """Feet and centimetres in a room of 4 m x 3 m x 3 m."""
+    room = dataclasses.replace(
+        scene,
+        vertices=np.array([[0, 0, 0], [4, 0, 0], [4, 3, 3]], np.float32),
+        faces=np.array([[0, 1, 2]], np.int32),
+        face_part=np.zeros(1, np.int32),
+        tx_positions=rng.uniform([2.5, 0.5, 0.5], [3.5, 2.5, 2.5], scene.tx_positions.shape),
+        rx_position=np.array([[3.5, 2.0, 2.0]]),
+    )
+    name = {"transmitters": "tx_positions", "receivers": "rx_position"}[antennas]
+    scaled = dataclasses.replace(room, **{name: scale * getattr(room, name)})
+    with warnings.catch_warnings(record=True) as notes:
+        warnings.simplefilter("always")
+        if outcome == "refused":
+            with pytest.raises(UserError, match=f"the {antennas} are not near the surfaces, .*; give both in metres"):
+                scene_dataset(scaled)
+        else:
+            scene_dataset(scaled)
+    assert [f"most {antennas} lie outside of" in str(note.message) for note in notes] == [True] * (outcome == "noted")
 
 
 def test_links_are_transmitter_major(scene):

@@ -243,20 +243,29 @@ def scene_dataset(scene: SceneFile) -> Dataset:
 
 
 def check_surroundings(dataset: Dataset) -> Dataset:
-    """Returns the dataset, after a comparison of its surfaces with its antennas.
+    """Returns the dataset, after a comparison of its surfaces with its transmitters and receivers; a warning reports
+    transmitters, or receivers, most of which are beside the surfaces.
 
     Raises:
-        UserError: every antenna is farther from the box of the surfaces than its longest side, as with another unit or frame.
+        UserError: all antennas are farther from the box of the surfaces than its longest side, or most transmitters or most
+            receivers much farther, as with another unit or frame.
     """
-    if len(dataset.faces):
-        used = dataset.vertices[dataset.faces].reshape(-1, 3).astype(np.float64)
-        low, high = used.min(0), used.max(0)
-        antennas = np.concatenate([dataset.tx_positions, np.asarray(dataset.receivers.position)])
-        distance = np.maximum(low - antennas, antennas - high).max(-1)
-        if distance.min() > (high - low).max():
-            raise UserError(
-                f"{dataset.name}: no antenna is near the surfaces, which lie between {np.round(low, 2).tolist()} and "
-                f"{np.round(high, 2).tolist()}; give both in metres, in one frame"
+    if not len(dataset.faces):
+        return dataset
+    used = dataset.vertices[dataset.faces].reshape(-1, 3).astype(np.float64)
+    low, high = used.min(0), used.max(0)
+    # Median distance in longest sides that is another unit, and those that are noted: receivers may be outdoors.
+    farthest, beside = 10.0, {"transmitters": 0.1, "receivers": 1.0}
+    positions = np.unique(dataset.tx_positions, axis=0), np.asarray(dataset.receivers.position)
+    distances = [np.maximum(low - own, own - high).max(-1) / (high - low).max() for own in positions]
+    for (antennas, noted), own in zip(beside.items(), distances, strict=True):
+        box = f"the surfaces, which lie between {np.round(low, 2).tolist()} and {np.round(high, 2).tolist()}"
+        if np.concatenate(distances).min() > 1 or np.median(own) > farthest:
+            raise UserError(f"{dataset.name}: the {antennas} are not near {box}; give both in metres, in one frame")
+        if np.median(own) > noted:
+            warnings.warn(
+                f"{dataset.name}: most {antennas} lie outside of {box}; unless this is so, give both in metres, in one frame",
+                stacklevel=3,
             )
     return dataset
 
