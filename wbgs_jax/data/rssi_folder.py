@@ -250,8 +250,9 @@ def _ids(path: Path, header: list[str], rows: list[list[str]], powers: list[str]
         UserError: there are other columns of unknown meaning.
     """
     columns = dict(zip(header, zip(*rows, strict=True), strict=True))
-    identifiers = ("id", "name", "receiver", "gateway", "anchor", "ap", "mac", "bssid")  # names of columns of ids, ...
-    identifiers += (*(f"{name}_id" for name in identifiers[2:6]), "rx", "label", "number", "ssid")
+    devices = ["receiver", "gateway", "anchor", "ap"]
+    # Names of columns of ids, ...
+    identifiers = ["id", "name", *devices, "mac", "bssid", *(f"{name}_id" for name in devices), "rx", "label", "number", "ssid"]
     # ... of columns that are ignored, and of those in which pandas counts rows.
     ignored = ("comment", "comments", "note", "notes", "description", "room", "location", "device", "model", "date")
     counted = [name for name in ("", "index", "unnamed: 0") if columns.get(name) == tuple(map(str, range(len(rows))))]
