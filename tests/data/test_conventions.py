@@ -1,9 +1,11 @@
 """Published folders order the pixels of a spectrum in two ways: both are read, told apart, or refused."""
 
+import dataclasses
 import shutil
 import warnings
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.commands import assert_error_for_people, call
@@ -116,6 +118,19 @@ def test_a_folder_is_read_as_it_reveals_or_as_it_is_named(tmp_path, rng):
     (folder / "gateway_info.yml").write_text((folder / "gateway_info.yml").read_text().replace(": elevation", ": north"))
     with pytest.raises(UserError, match="convention is 'north'; it must be zenith or elevation"):
         load_layout(folder)
+
+
+@pytest.mark.parametrize("convention", ["zenith", "elevation"])
+def test_a_quaternion_in_another_order_is_noted(tmp_path, rng, convention):
+    """From ten transmitters on."""
+    images, receiver, tx, _ = room(rng, 20, convention)
+    for n, written, noted in ((20, 1, True), (20, 0, False), (11, 1, False)):
+        turn = dataclasses.replace(receiver, orientation=jnp.roll(receiver.orientation, written))
+        folder = folder_of(images[:n], turn, tx[:n], tmp_path / f"{n}-{written}")
+        with warnings.catch_warnings(record=True) as notes:
+            warnings.simplefilter("always")
+            load_layout(folder, 1e9, convention=convention)
+        assert ["clearly better if the orientation is w, x, y, z" in str(note.message) for note in notes] == [True] * noted
 
 
 def test_what_the_test_shows_does_not_decide(tmp_path, rng):

@@ -17,7 +17,7 @@ from typing import Literal, get_args
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Array, Float, Int, UInt8
 from scipy.special import stdtrit
 
 from wbgs_jax._util.statistics import by_transmitter
@@ -79,16 +79,49 @@ def find_convention(
     ranks = [_brighter(images[above], *_pixel(local[above], name)) for name in CONVENTIONS]
     first, second = (by_transmitter(rank, tx_index[above]) for rank in ranks)
     gain = second - first
-    error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else np.inf
     compared = (
         f"towards the transmitter, spectra are brighter than {100 * second.mean():.0f} % of their pixels read as elevations"
     )
     compared += f" and than {100 * first.mean():.0f} % read as zenith angles"
-    # Probability that lines of sight favour a convention by chance, and minimum number of transmitters for the test.
-    chance, fewest = 1e-3, 5
-    if len(gain) < fewest or not abs(gain.mean()) > stdtrit(len(gain) - 1, 1 - chance / 2) * error:
+    fewest = 5  # transmitters
+    if len(gain) < fewest or not _significant(gain):
         return Evidence(None, compared)
     return Evidence("elevation" if gain.mean() > 0 else "zenith", compared)
+
+
+def turned(
+    images: UInt8[np.ndarray, "n 90 360"],
+    receiver: Receiver,
+    tx_positions: Float[np.ndarray, "n 3"],
+    tx_index: Int[np.ndarray, " n"],
+    convention: ConventionName,
+) -> bool:
+    """Returns whether lines of sight fit the spectra clearly better if the receiver's quaternion is w, x, y, z in the file.
+
+    Args:
+        images: as stored in the folder.
+        receiver: whose quaternion was read as x, y, z, w.
+        tx_positions: world frame, metres.
+        tx_index: index of the transmitter.
+        convention: of the images.
+    """
+    towards = jnp.asarray(tx_positions - np.asarray(receiver.position, np.float64))
+
+    def brightness(orientation: Float[Array, "4"]) -> Float[np.ndarray, " t"]:
+        local = np.asarray(to_local(towards, orientation))
+        rank = _brighter(images, *_pixel(local, convention))
+        return by_transmitter(np.where(local[:, 2] > 0, rank, 0.5), tx_index)  # nothing is known below the horizon
+
+    gain = brightness(jnp.roll(receiver.orientation, -1)) - brightness(receiver.orientation)
+    fewest, clear = 10, 0.1  # transmitters, and mean gain in the share of pixels that are less bright
+    return len(gain) >= fewest and float(gain.mean()) > clear and _significant(gain)
+
+
+def _significant(gain: Float[np.ndarray, " t"]) -> bool:
+    """Returns whether the mean of differences is not zero by chance."""
+    chance = 1e-3
+    error = gain.std(ddof=1) / np.sqrt(len(gain))
+    return bool(abs(gain.mean()) > stdtrit(len(gain) - 1, 1 - chance / 2) * error)
 
 
 def _by_the_zenith(images: UInt8[np.ndarray, "n 90 360"]) -> Evidence | None:

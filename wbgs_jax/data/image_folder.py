@@ -34,7 +34,7 @@ from PIL import Image
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_text, read_yaml, safe_name
-from wbgs_jax.data.conventions import CONVENTIONS, ConventionName, array_of, find_convention, to_pas
+from wbgs_jax.data.conventions import CONVENTIONS, ConventionName, Evidence, array_of, find_convention, to_pas, turned
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import check_surroundings, materials_of, scene_dataset
 from wbgs_jax.data.scene_file import Room, SceneFile, check_mesh, load_room
@@ -179,7 +179,15 @@ def load_layout(
     else:
         train, test = tx_disjoint_split(tx_index, test_fraction, seed)
         split = {"train": train, "validation": train[:0], "test": test}
-    named = _agreed(convention, gateway.convention, folder) or _inferred(folder, images, gateway, positions, tx_index, split)
+    trained = np.sort(np.concatenate([split["train"], split["validation"]]))
+    shown = images[trained], make_receiver(gateway.position, gateway.orientation), positions[trained], tx_index[trained]
+    named = _agreed(convention, gateway.convention, folder) or _inferred(folder, find_convention(*shown))
+    if turned(*shown, named):
+        warnings.warn(
+            f"{folder / GATEWAY}: lines of sight fit the spectra clearly better if the orientation is w, x, y, z; write it as "
+            "x, y, z, w, [0, 0, 0, 1] for no rotation",
+            stacklevel=2,
+        )
     receiver = make_receiver(gateway.position, gateway.orientation, array_of(named))
     dataset = Dataset(
         name=gateway.name or safe_name(folder.resolve().name),
@@ -343,18 +351,8 @@ def _agreed(wanted: ConventionName | None, named: ConventionName | None, folder:
     return named if wanted is None else wanted
 
 
-def _inferred(
-    folder: Path,
-    images: UInt8[np.ndarray, "n 90 360"],
-    gateway: Gateway,
-    positions: Float[np.ndarray, "n 3"],
-    tx_index: np.ndarray,
-    split: dict[str, np.ndarray],
-) -> ConventionName:
-    """Returns the convention inferred from the spectra outside the test."""
-    trained = np.sort(np.concatenate([split["train"], split["validation"]]))
-    receiver = make_receiver(gateway.position, gateway.orientation)
-    found = find_convention(images[trained], receiver, positions[trained], tx_index[trained])
+def _inferred(folder: Path, found: Evidence) -> ConventionName:
+    """Returns the convention inferred from the spectra outside the test, with a warning."""
     choices = " or ".join(CONVENTIONS)
     if found.convention is None:
         raise UserError(
