@@ -261,7 +261,7 @@ def test_what_is_received_does_not_depend_on_the_transmitted_power(dbm):
     answer |= {"xs": np.arange(2.0), "ys": np.arange(2.0), "frequencies_hz": HERTZ[:1], "tx_positions": np.eye(3)[:2]}
     shown = draw_maps("rsrp", answer, WALLS, SOURCE).axes[0].images[0].get_array().filled(np.nan)
     np.testing.assert_array_equal(np.isnan(shown), [[True, False], [False, False]])
-    (curve,) = draw_distribution("rsrp", answer | {"no_confidence": np.zeros((2, 2), bool)}).axes[0].lines
+    (curve,) = draw_distribution("rsrp", answer | {"no_confidence": np.zeros((2, 2), bool)}, SOURCE).axes[0].lines
     np.testing.assert_allclose(curve.get_xydata()[:, 0], np.array([-240, -90, -80]) + dbm)
 
 
