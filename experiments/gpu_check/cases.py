@@ -35,8 +35,8 @@ ON_THE_HOST = frozenset(
     from_deepmimo from_paths from_sionna get_field learn_map load_dataset load_deepmimo load_exported load_paths load_readings
     load_room load_scene load_trained load_walls make_locator make_mesh make_power_predictor make_predictor
     make_movement make_query make_receiver make_surface map_queries measure_limits pas_directions person place_reflector
-    plan_movement planar_array
-    power_at_users power_when_rotated predict_blocks predict_gains predict_isotropic_paths predict_many predict_map predict_paths
+    plan_movement planar_array power_at_users power_when_rotated
+    predict_blocks predict_gains predict_isotropic_paths predict_many predict_map predict_paths
     pytree rank_beams read_antenna read_deepmimo read_gaussians register save_paths save_scene scene_of_paths
     scene_of_sionna scene_of_snapshots score_beams stack_receivers static straight_powers surface_from_points
     train_field walking_order write_deepmimo write_gaussians
