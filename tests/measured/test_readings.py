@@ -218,7 +218,8 @@ def test_a_column_of_ids_has_any_name(tmp_path, rng, column):
     [
         ("unit", ["ft"] * 3, r"columns of unknown meaning \('unit'\); remove them, and"),
         ("offset_db", ["1.5", "2", "-3"], "'offset_db'"),
-        ("Floor", ["1", "2", "3"], r"\('floor'\); remove them \(heights are in z\), and name"),
+        ("Floor", ["1", "2", "3"], "at the same height"),
+        ("Floor", ["1", "1", "1"], None),
         ("", ["7", "8", "9"], "unknown meaning"),
         ("", ["0", "1", "2"], None),  # as pandas counts rows
         ("comment", ["new", "", "old"], None),

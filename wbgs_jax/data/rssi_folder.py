@@ -214,8 +214,9 @@ def _load_tables(folder: Path, height: float) -> Readings:
     parts = [header.index(name) for name in room_columns if name in header]
     if places.shape[1] == 2 and set(FLOORS) & set(header):
         raise UserError(f"{path} has a column of floors but no heights; add the column z, metres in the receivers' frame")
-    for name in (column for column in FLOORS if column in header):
-        _check_floors(path, name, [row[header.index(name)] for row in rows], places[:, 2])
+    for file, columns, cells, points in ((path, header, rows, places), (of_receivers, names, entries, receivers)):
+        for name in (column for column in FLOORS if column in columns):
+            _check_floors(file, name, [row[columns.index(name)] for row in cells], points[:, 2])
     if places.shape[1] == 2:
         places = np.column_stack([places, np.full(len(places), height)])
     rooms = tuple("/".join(row[part] for part in parts if row[part]) for row in rows)
@@ -254,17 +255,16 @@ def _ids(path: Path, header: list[str], rows: list[list[str]], powers: list[str]
     # Names of columns of ids, ...
     identifiers = ["id", "name", *devices, "mac", "bssid", *(f"{name}_id" for name in devices), "rx", "label", "number", "ssid"]
     # ... of columns that are ignored, and of those in which pandas counts rows.
-    ignored = ("comment", "comments", "note", "notes", "description", "room", "location", "device", "model", "date")
+    ignored = ("comment", "comments", "note", "notes", "description", "room", "location", "device", "model", "date", *FLOORS)
     counted = [name for name in ("", "index", "unnamed: 0") if columns.get(name) == tuple(map(str, range(len(rows))))]
     others = [name for name in header if name not in ("x", "y", "z", *identifiers, *ignored, *counted)]
     known = [name for name in identifiers if name in header]
-    candidates = known + (others if len(others) == 1 and others[0] not in FLOORS else [])
+    candidates = known + (others if len(others) == 1 else [])
     ids = next((name for name in candidates if _match(path, powers, columns[name])), next(iter(known), None))
     if unknown := [name for name in others if name != ids]:
-        heights = " (heights are in z)" * bool(set(unknown) & set(FLOORS))
         raise UserError(
-            f"{path} has columns of unknown meaning ({', '.join(map(repr, unknown))}); remove them{heights}, and name a "
-            "column of ids 'id', or of remarks 'comment'"
+            f"{path} has columns of unknown meaning ({', '.join(map(repr, unknown))}); remove them, and name a column of ids "
+            "'id', or of remarks 'comment'"
         )
     return () if ids is None else columns[ids]
 
