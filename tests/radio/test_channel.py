@@ -140,7 +140,7 @@ def test_slopes_of_correlation_are_finite_where_it_is_zero():
     for a, b in ((0 * one, one), (one, 0 * one), (one, other)):
         for slope in jax.grad(correlation, (0, 1))(a, b):
             assert np.isfinite(slope).all()
-    assert float(correlation(one, other)) == 0
+    assert float(correlation(one, other)) < 1e-6  # fused products leave a rounding
 
 
 def test_angles_of_two_paths_spread_by_their_separation():
