@@ -5,7 +5,6 @@ wall between rooms has two faces. A column `room` separates several outlines, or
 end. Metres.
 """
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
-from wbgs_jax.data.tables import check_positions, numbers, read_table
+from wbgs_jax.data.tables import check_positions, numbers, read_lines, read_table
 
 FILES = ("walls.csv", "layout.csv")
 ON_WALL = 1e-2
@@ -85,8 +84,7 @@ def load_walls(path: Path) -> Walls:
 
 def _gaps(path: Path) -> Int[np.ndarray, " g"]:
     """Returns the rows of a CSV file that more empty lines precede than others (some programs write one after every row)."""
-    with path.open(newline="", encoding="utf-8-sig") as stream:
-        empty = np.array([not any(map(str.strip, row)) for row in csv.reader(stream)])
+    empty = np.array([not any(row) for _, row in read_lines(path)])
     before = np.diff(np.cumsum(empty)[~empty][1:])  # every row but the header and the first
     return 1 + np.flatnonzero(before > before.min(initial=len(empty)))
 

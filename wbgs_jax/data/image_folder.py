@@ -39,6 +39,7 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import check_surroundings, materials_of, scene_dataset
 from wbgs_jax.data.scene_file import Room, SceneFile, check_mesh, load_room
 from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters, tx_disjoint_split
+from wbgs_jax.mesh.bodies import share_in_box
 from wbgs_jax.mesh.ply import read_ply, write_ply
 from wbgs_jax.observation_kinds import KINDS
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
@@ -275,12 +276,8 @@ def _read_room(folder: Path) -> Room:
 
 def _check_axes(path: Path, vertices: Float[np.ndarray, "v 3"], antennas: Float[np.ndarray, "n 3"]) -> None:
     """Raises a `UserError` if antennas lie outside of a mapped mesh and all of them inside of it as it was written."""
-
-    def outside(points: Float[np.ndarray, "v 3"]) -> float:
-        return float(np.any((antennas < points.min(0)) | (antennas > points.max(0)), 1).mean())
-
-    many = 0.1  # share of antennas; a few stand outside of many rooms
-    if len(vertices) and outside(vertices) > many and not outside(world_to_mesh(vertices)):
+    most = 0.9  # share of antennas; a few stand outside of many rooms
+    if len(vertices) and share_in_box(antennas, vertices) < most and share_in_box(antennas, world_to_mesh(vertices)) == 1:
         raise UserError(
             f"{path} surrounds the antennas as written, but not when turned from z-up to the layout's y-up frame: they share "
             f"one frame; write it as {ROOM} instead (wbgs-jax convert)"

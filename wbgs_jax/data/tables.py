@@ -94,20 +94,29 @@ def found(folder: Path, names: tuple[str, ...]) -> Path:
     raise UserError(f"{folder} has no {' or '.join(names)}; create it as described in docs/measured.md")
 
 
+def read_lines(path: Path) -> list[tuple[int, list[str]]]:
+    """Returns the lines of a CSV file with their numbers; the cells of empty ones are empty.
+
+    Raises:
+        UserError: the file is missing or not a CSV file.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.reader(stream)
+            return [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+    except UnicodeDecodeError:
+        raise UserError(f"{path} is not a text file in UTF-8; save it as CSV in UTF-8") from None
+    except (OSError, csv.Error) as error:
+        raise UserError(f"{path} cannot be read: {error}; check the path, or save it again as CSV") from None
+
+
 def read_table(path: Path) -> tuple[list[str], list[list[str]]]:
     """Returns the header of a CSV file in lower case, and its rows, all of the same length.
 
     Raises:
         UserError: the file is missing, not a CSV file, or has no rows.
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            reader = csv.reader(stream)
-            lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if any(map(str.strip, row))]
-    except UnicodeDecodeError:
-        raise UserError(f"{path} is not a text file in UTF-8; save it as CSV in UTF-8") from None
-    except (OSError, csv.Error) as error:
-        raise UserError(f"{path} cannot be read: {error}; check the path, or save it again as CSV") from None
+    lines = [(number, row) for number, row in read_lines(path) if any(row)]
     if len(lines) < 2:
         raise UserError(f"{path} has no rows after its header")
     header = [name.lower() for name in lines[0][1]]

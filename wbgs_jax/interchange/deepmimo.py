@@ -22,8 +22,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write, read_arrays, read_json, write_json
-from wbgs_jax.interchange.matlab import read_mat
+from wbgs_jax._util.files import atomic_write, read_json, write_json
+from wbgs_jax.interchange.matlab import read_mat_or_npz
 from wbgs_jax.interchange.ray_paths import (
     DIFFRACTION,
     DIFFUSE,
@@ -93,11 +93,7 @@ def read_pair(folder: Path, pair: Pair) -> dict[str, np.ndarray]:
 
 def read_file(path: Path) -> dict[str, np.ndarray]:
     """Returns the numeric arrays of an .npz or .mat file by name."""
-    return (
-        read_mat(path)
-        if path.suffix.lower() == ".mat"
-        else read_arrays(path, "", "check the path; give an .npz or a .mat file")
-    )
+    return read_mat_or_npz(path, "check the path; give an .npz or a .mat file")
 
 
 def parameters(folder: Path) -> dict[str, Any]:

@@ -1,4 +1,5 @@
-"""Reads numeric arrays from MATLAB files (.mat, version 5, as SciPy and DeepMIMO write them), and nothing else.
+"""Reads numeric arrays, and nothing else, from MATLAB files (.mat, version 5, as SciPy and DeepMIMO write them), or from .npz
+files with the same arrays.
 
 SciPy's own reader crashes the process on files with damaged sizes; this one checks every size first.
 """
@@ -12,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wbgs_jax._util.files import MOST_BYTES, check_file, told
+from wbgs_jax._util.files import MOST_BYTES, check_file, read_arrays, told
 
 HEADER, MATRIX, COMPRESSED = 128, 14, 15
 STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
@@ -26,6 +27,15 @@ class Element(NamedTuple):
 
     type: int
     content: memoryview
+
+
+def read_mat_or_npz(path: Path, advice: str) -> dict[str, np.ndarray]:
+    """Returns the numeric arrays of a .mat file, or those of an .npz file, by name; `advice` ends messages about the latter.
+
+    Raises:
+        UserError: the file is missing or damaged.
+    """
+    return read_mat(path) if path.suffix.lower() == ".mat" else read_arrays(path, "", advice)
 
 
 def read_mat(path: Path) -> dict[str, np.ndarray]:

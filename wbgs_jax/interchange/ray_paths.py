@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int, Integer
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write, read_arrays
-from wbgs_jax.interchange.matlab import read_mat
+from wbgs_jax._util.files import atomic_write
+from wbgs_jax.interchange.matlab import read_mat_or_npz
 from wbgs_jax.propagation.paths import InteractionType, is_vertex
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ
@@ -242,8 +242,7 @@ def read_paths(path: Path | str) -> dict[str, np.ndarray]:
     Raises:
         UserError: the file is missing or damaged.
     """
-    path = Path(path)
-    arrays = read_mat(path) if path.suffix.lower() == ".mat" else read_arrays(path, "", "check the path, or write it again")
+    arrays = read_mat_or_npz(Path(path), "check the path, or write it again")
     if "a_real" in arrays and "a_imag" in arrays:
         arrays["a"] = _complex(arrays.pop("a_real"), arrays.pop("a_imag"), f"a of {path}")
     return arrays

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import Room, load_room
 from wbgs_jax.interchange.room_materials import Slab, slabs_of
+from wbgs_jax.mesh.bodies import share_in_box
 from wbgs_jax.mesh.importers import Y_UP, FileObject, read_objects
 from wbgs_jax.mesh.walls import divided, hidden_walls, walls_as_sheets
 
@@ -98,13 +99,9 @@ def check_upright(path: Path, room: Room, antennas: Float[np.ndarray, "n 3"]) ->
     """Raises a `UserError` if most antennas (metres) are outside of the box around a room, but inside if the room is turned so
     that the other axis, y or z, points up."""
 
-    def inside(turn: Float[np.ndarray, "3 3"]) -> float:
-        corners = room.vertices @ turn.T
-        return float(((antennas >= corners.min(0)) & (antennas <= corners.max(0))).all(1).mean())
-
     few, many = 0.6, 0.9  # shares of antennas inside
-    turn = Y_UP[:3, :3]
-    if (here := inside(np.eye(3))) < few and (turned := max(inside(turn), inside(turn.T))) > many:
+    here, turn = share_in_box(antennas, room.vertices), Y_UP[:3, :3]
+    if here < few and (turned := max(share_in_box(antennas, room.vertices @ one) for one in (turn, turn.T))) > many:
         advice = "convert its model again with" if path.suffix.lower() == ".npz" else "give"
         raise UserError(
             f"{path} lies on its side: {here:.0%} of the antennas are inside of its box, but {turned:.0%} once it is upright; "

@@ -55,6 +55,11 @@ class ClosedBody(NamedTuple):
     """Corners of the triangles, metres."""
 
 
+def share_in_box(points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"]) -> float:
+    """Returns the share of points (metres) that lie in the box around vertices."""
+    return float(((points >= vertices.min(0)) & (points <= vertices.max(0))).all(1).mean())
+
+
 def inside(body: ClosedBody, points: Float[AnyArray, "n 3"], xp: Any = np) -> Bool[AnyArray, " n"]:
     """Returns which points (metres) lie inside a body. `xp` is the module of the arrays, NumPy or `jax.numpy`."""
     if xp is not np:

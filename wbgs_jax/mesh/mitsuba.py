@@ -131,12 +131,8 @@ BUILT_IN: dict[str, Callable[[ET.Element], trimesh.Trimesh]] = {
 
 
 def _value(shape: ET.Element, name: str, missing: float) -> float:
-    found = _number(shape, name)
+    found = next((one for one in shape if one.tag in ("float", "integer") and one.get("name") == name), None)
     return missing if found is None else float(found.get("value", missing))
-
-
-def _number(element: ET.Element, name: str) -> ET.Element | None:
-    return next((one for one in element if one.tag in ("float", "integer") and one.get("name") == name), None)
 
 
 def _point(shape: ET.Element, name: str, missing: tuple[float, float, float]) -> Float[np.ndarray, "3"]:

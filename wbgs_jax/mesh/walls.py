@@ -86,6 +86,8 @@ def divided(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
     """Returns the walls of a mesh, one mesh for each thickness, and the rest; the mesh itself if it is all of one kind.
     Programs that name objects by their class give one name to walls of several thicknesses."""
     bodies = list(mesh.split(only_watertight=False)) if mesh.is_watertight else []
+    if len(bodies) < 2:
+        return [mesh]
     found = [_wall(body, body.bounds.mean(0)[None]) for body in bodies]
     panel = 0.05  # metres: thickness below which a body is a panel of furniture
     depths = [0.0 if wall is None or wall.thickness < panel else wall.thickness for wall in found]
@@ -94,8 +96,7 @@ def divided(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
         if not kinds or depths[i] > SAME_DEPTH * depths[kinds[-1][0]]:
             kinds.append([])
         kinds[-1].append(int(i))
-    pieces = [trimesh.util.concatenate([bodies[i] for i in kind]) for kind in kinds] if len(kinds) > 1 else [mesh]
-    return [piece for piece in pieces if isinstance(piece, trimesh.Trimesh)]
+    return [_joined([bodies[i] for i in kind]) for kind in kinds] if len(kinds) > 1 else [mesh]
 
 
 def hidden_walls(mesh: trimesh.Trimesh) -> float:
@@ -205,7 +206,7 @@ def _touch(first: Sheet, second: Sheet) -> bool:
     return bool((first.bounds[0] < second.bounds[1] + NEAR).all() and (second.bounds[0] < first.bounds[1] + NEAR).all())
 
 
-def _joined(sheets: Sequence[Sheet]) -> trimesh.Trimesh:
+def _joined(sheets: Sequence[Sheet | trimesh.Trimesh]) -> trimesh.Trimesh:
     starts = np.cumsum([0, *(len(sheet.vertices) for sheet in sheets)])
     faces = [sheet.faces + start for sheet, start in zip(sheets, starts, strict=False)]
     return trimesh.Trimesh(np.concatenate([sheet.vertices for sheet in sheets]), np.concatenate(faces), process=False)
