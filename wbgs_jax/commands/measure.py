@@ -37,6 +37,7 @@ from wbgs_jax.evaluation.report import environment
 from wbgs_jax.inference.domain import Domain
 from wbgs_jax.plotting import draw_power_maps, save
 from wbgs_jax.power_map.model import PowerMap, learn_map, received_power
+from wbgs_jax.power_map.scales import Scales
 from wbgs_jax.power_map.survey import find_walls, load_survey
 from wbgs_jax.power_map.validation import COMPARED, NINETY, Score, scores
 
@@ -116,8 +117,8 @@ def report(learned: PowerMap, found: list[Score], command: Command, size: float)
         "data": command.data.resolve().name,
         "attribution": attribution(command.data),
         "cell_m": size,
-        "law": dict(zip(("dbm_at_one_metre", "exponent", "first_wall_db"), law, strict=True)),
-        "scales_db": dict(zip(("room", "wall", "place", "reading"), scales, strict=True)),
+        "law": dict(zip(("dbm_at_one_metre", "exponent", "first_wall_db", "first_ceiling_db"), law, strict=True)),
+        "scales": dict(zip((field.name for field in dataclasses.fields(Scales)), scales, strict=True)),
         "scores": {_key(score.held_out): _as_json(score) for score in found},
         "environment": environment(),
     }

@@ -1,16 +1,17 @@
-"""Received power, averaged over fading, as a function of the transmitter's position: a path loss law with distance and walls,
-and a Gaussian process for its residuals.
+"""Received power, averaged over fading, as a function of the transmitter's position: a path loss law with distance, walls and
+storeys, and a Gaussian process for its residuals.
 
-    P_r(x) = a - 10 n log10 d - l sqrt(w) + u_r(x) + sqrt(w) v_r(x)
+    P_r(x) = a - 10 n log10 d - l sqrt(w) - s L(k) + g_r + u_r(x) + sqrt(w) v_r(x)
 
-with d the distance to receiver r and w the number of walls in between. Further walls cost less than the first one, since waves
-through doors and around corners do not cross them (compare the multi-wall model of COST 231, final report, section 4.7, with
-its decreasing loss of further floors). The law is common to all receivers and fitted by least squares, in which the readings of
-one square metre count as one, so that it holds where nothing was measured. The residuals u and v, due to rooms and individual
-walls, decay with the distance from the measurements (exponential covariance; Rasmussen and Williams 2006, chapter 2).
+with d the distance to receiver r, w the number of walls and k the number of ceilings in between. Further walls and ceilings
+cost less than the first one, since waves through doors, around corners and along facades do not cross them: L(k) is the
+decreasing loss of further floors of the multi-wall model (COST 231, final report, section 4.7), and sqrt(w) its counterpart for
+walls. The law is common to all receivers and fitted by least squares, in which the readings of one square metre count as one,
+so that it holds where nothing was measured. The residuals are the gain g of a receiver, u, due to rooms and furniture, and v,
+due to individual walls. A part of u decays within a metre, as v does, another one over rooms (exponential covariances;
+Rasmussen and Williams 2006, chapter 2). Its length and all shares follow from the data (`scales.learn_scales`).
 """
 
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -18,18 +19,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
-from scipy.optimize import minimize
+from scipy.linalg import cho_solve, solve_triangular
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.data.floor_plan import NO_WALLS, Walls, crossings, namespace
 from wbgs_jax.data.rssi_folder import Readings
+from wbgs_jax.power_map.scales import Scales, covariance, distances, learn_scales, noise
 from wbgs_jax.radio.array import EXACT
 
-LAW = np.array([-45.0, 2.0, 6.0])
-"""Prior means of the power at one metre (dBm), the exponent and the loss of a wall (dB), ..."""
-LAW_WIDTH = np.array([30.0, 1.0, 4.0])
+LAW = np.array([-45.0, 2.0, 6.0, 15.0])
+"""Prior means of the power at one metre (dBm), the exponent, the loss of a wall and of a ceiling (dB), ..."""
+LAW_WIDTH = np.array([30.0, 1.0, 4.0, 8.0])
 """... and their prior standard deviations."""
 APART = 5.0
 """Standard deviation of the error of the law where readings within a metre count as one, dB."""
@@ -39,23 +40,6 @@ MAX_PLACES = 1500
 """Maximum number of positions of a map."""
 MIN_POWERS = 10
 """Minimum number of received powers to learn from."""
-LENGTH = 1.0
-"""Correlation length of u and v, metres. It is not learned: the maximum-likelihood value in one room is longer and gives wrong
-predictions in the next."""
-
-
-@dataclass(frozen=True)
-class Scales:
-    """Standard deviations of the residuals of the law, dB."""
-
-    room: float = 4.0
-    """Standard deviation of u (rooms), ..."""
-    wall: float = 4.0
-    """... of v (walls), ..."""
-    place: float = 0.5
-    """... of the part that is not a function of the position, ..."""
-    reading: float = 4.5
-    """... and of a single reading (fading)."""
 
 
 @pytree
@@ -64,13 +48,15 @@ class PowerMap:
 
     receivers: Float[Array, "r 3"]
     walls: Walls
+    ceilings: Float[Array, " c"]
+    """Heights of the ceilings between storeys, metres."""
     places: Float[Array, "n 3"]
-    law: Float[Array, "3"]
-    """Power at one metre (dBm), exponent, loss of the first wall (dB)."""
-    law_covariance: Float[Array, "3 3"]
-    scales: Float[Array, "4"]
+    law: Float[Array, "4"]
+    """Power at one metre (dBm), exponent, loss of the first wall and of the first ceiling (dB)."""
+    law_covariance: Float[Array, "4 4"]
+    scales: Float[Array, "7"]
     """The values of `Scales`, in order."""
-    features: Float[Array, "n r"]
+    root_walls: Float[Array, "n r"]
     """sqrt(w) of the positions."""
     weights: Float[Array, "r n"]
     """(K + noise)^-1 (powers - law)."""
@@ -84,7 +70,7 @@ def learn_map(readings: Readings, walls: Walls = NO_WALLS, scales: Scales | None
     Args:
         readings: at most `MAX_PLACES` positions.
         walls: of the floor plan.
-        scales: standard deviations of the residuals; by default they are learned.
+        scales: standard deviations of the residuals and their length; by default they are learned.
 
     Returns:
         The map, a pytree for `received_power`.
@@ -97,21 +83,21 @@ def learn_map(readings: Readings, walls: Walls = NO_WALLS, scales: Scales | None
         raise UserError(f"{int(received.sum())} powers are too few to learn from; at least {MIN_POWERS} are needed")
     if len(readings.places) > MAX_PLACES:
         raise UserError(f"{len(readings.places)} positions exceed the limit of a map ({MAX_PLACES}); average over larger cells")
-    law_features = _law_features(readings.places, readings.receivers, walls)
-    law, covariance = _law(readings, law_features)
-    left = np.where(received, readings.powers - law_features @ law, 0)
+    ceilings = find_ceilings(readings.places[:, 2])
+    features = law_features(readings.places, readings.receivers, walls, ceilings)
+    law, law_covariance = fit_law(readings, features)
+    root_walls, left = -features[..., 2], np.where(received, readings.powers - features @ law, 0)
     if scales is None:
-        scales = learn_scales(readings, -law_features[..., 2], left)
-    root_walls, n = -law_features[..., 2], len(readings.places)
+        scales = learn_scales(readings, root_walls, left)
+    n = len(readings.places)
     weights, roots = np.zeros((len(readings.receivers), n)), np.zeros((len(readings.receivers), n, n))
     for r in range(len(readings.receivers)):
         own = np.flatnonzero(received[:, r])
-        k = _covariance(scales, readings.places[own], root_walls[own, r])
-        k[np.diag_indices(len(own))] += noise(scales, readings.counts[own, r])
-        factor = np.linalg.cholesky(k)
+        factor = np.linalg.cholesky(covariance_of_powers(scales, readings, root_walls, own, r))
         weights[r, own] = cho_solve((factor, True), left[own, r])
         roots[r][np.ix_(own, own)] = solve_triangular(factor, np.eye(len(own)), lower=True)
-    arrays = readings.places, law, covariance, np.array([*vars(scales).values()]), root_walls, weights, roots
+    numbers = np.array([*vars(scales).values()])
+    arrays = ceilings, readings.places, law, law_covariance, numbers, root_walls, weights, roots
     return PowerMap(*jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), (readings.receivers, walls, *arrays)))
 
 
@@ -126,95 +112,61 @@ def received_power(learned: PowerMap, tx_position: Float[Array, "b 3"]) -> tuple
     Returns:
         Mean (b, r), dBm, and standard deviation (b, r), dB.
     """
-    features = _law_features(tx_position, learned.receivers, learned.walls)
-    room, wall = learned.scales[:2]
-    walls = -features[..., 2]
-    k = alike(tx_position, learned.places)[:, None] * (room**2 + wall**2 * walls[..., None] * learned.features.T)
+    features = law_features(tx_position, learned.receivers, learned.walls, learned.ceilings)
+    scales, root_walls = Scales(*learned.scales), -features[..., 2]
+    apart = distances(tx_position, learned.places)[:, None]
+    k = covariance(scales, apart, root_walls[..., None], learned.root_walls.T)
     exact = partial(jnp.einsum, precision=EXACT)  # the variance is a difference of large numbers
     mean = exact("bri,i->br", features, learned.law) + exact("brn,rn->br", k, learned.weights)
     explained = jnp.sum(exact("rmn,brn->brm", learned.inverse_root, k) ** 2, -1)
     of_law = exact("bri,ij,brj->br", features, learned.law_covariance, features)
-    variance = room**2 + wall**2 * walls**2 - explained + of_law
+    variance = covariance(scales, 0.0, root_walls, root_walls) - explained + of_law
     return mean, jnp.sqrt(jnp.maximum(variance, 0))
 
 
-def distances(a: Any, b: Any) -> Any:
-    """Returns the distances (metres) of positions (n, 3) from others (m, 3) as (n, m), with a finite gradient at 0."""
-    return namespace(a).sqrt(namespace(a).sum((a[:, None] - b) ** 2, -1) + 1e-12)
+def find_ceilings(heights: Float[np.ndarray, " n"]) -> Float[np.ndarray, " c"]:
+    """Returns the heights of the ceilings between transmitters of several storeys, metres: below each storey's lowest
+    transmitter by the height at which a person carries it, but not below the middle to the storey underneath."""
+    carried, storey = 1.3, 1.8  # metres: height above the floor, and the smallest step of heights between storeys
+    levels = np.unique(heights)
+    below, above = levels[:-1], levels[1:]
+    return np.maximum(above - carried, (below + above) / 2)[above - below > storey]
 
 
-def alike(a: Any, b: Any) -> Any:
-    """Returns the correlation (n, m) of the residuals at positions (n, 3) and at others (m, 3)."""
-    return namespace(a).exp(-distances(a, b) / LENGTH)
-
-
-def noise(scales: Scales, counts: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Returns the variance (dB^2) of means of `counts` readings around the part that is a function of the position."""
-    return scales.place**2 + scales.reading**2 / counts
-
-
-def _law_features(tx: Any, receivers: Any, walls: Walls) -> Any:
-    """Returns the factors (b, r, 3) of the law's three parameters."""
+def law_features(tx: Any, receivers: Any, walls: Walls, ceilings: Any) -> Any:
+    """Returns the factors (b, r, 4) of the law's four parameters."""
     xp = namespace(tx)
     distance = xp.maximum(distances(tx, receivers), NEAREST)
     between = crossings(walls, tx[:, None, :2], receivers[None, :, :2])
     root = xp.sqrt(xp.where(between > 0, between, 1.0)) * (between > 0)
-    return xp.stack([xp.ones_like(distance), -10 * xp.log10(distance), -root], -1)
+    below = [xp.sum(at[:, 2, None] > ceilings, -1) for at in (tx, receivers)]
+    storeys = xp.abs(below[0][:, None] - below[1])
+    decrease = 0.46  # b of COST 231, section 4.7
+    further = xp.maximum(storeys, 1) ** ((storeys + 2) / (storeys + 1) - decrease) * (storeys > 0)
+    return xp.stack([xp.ones_like(distance), -10 * xp.log10(distance), -root, -further], -1)
 
 
-def _law(readings: Readings, features: Float[np.ndarray, "n r 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+def fit_law(
+    readings: Readings, features: Float[np.ndarray, "n r 4"]
+) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "4 4"]]:
     """Returns the law by least squares with a normal prior, and its covariance."""
-    side = 1.0  # metres: the readings within a square of this size count as one reading in the fit of the law
-    _, square = np.unique(np.floor(readings.places / side).astype(int), axis=0, return_inverse=True)
+    side = 1.0  # metres: the readings within a cube of this size count as one reading in the fit of the law
+    _, cube = np.unique(np.floor(readings.places / side).astype(int), axis=0, return_inverse=True)
     received = np.isfinite(readings.powers)
     weights = np.zeros(readings.powers.shape)
     for r in range(len(readings.receivers)):
-        own = square.reshape(-1)[received[:, r]]
-        weights[received[:, r], r] = 1 / (APART**2 * np.bincount(own, minlength=square.max() + 1)[own])
+        own = cube.reshape(-1)[received[:, r]]
+        weights[received[:, r], r] = 1 / (APART**2 * np.bincount(own, minlength=cube.max() + 1)[own])
     left = np.where(received, readings.powers - features @ LAW, 0)
     precision = np.einsum("nri,nr,nrj->ij", features, weights, features) + np.diag(LAW_WIDTH**-2.0)
-    covariance = np.linalg.inv(precision)
-    return LAW + covariance @ np.einsum("nri,nr,nr->i", features, weights, left), covariance
+    law_covariance = np.linalg.inv(precision)
+    return LAW + law_covariance @ np.einsum("nri,nr,nr->i", features, weights, left), law_covariance
 
 
-def _covariance(
-    scales: Scales, places: Float[np.ndarray, "n 3"], root_walls: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, "n n"]:
-    """Returns the covariance of the residuals at one receiver."""
-    return alike(places, places) * (scales.room**2 + scales.wall**2 * np.outer(root_walls, root_walls))
-
-
-def learn_scales(readings: Readings, root_walls: Float[np.ndarray, "n r"], left: Float[np.ndarray, "n r"]) -> Scales:
-    """Returns the scales of maximum posterior probability, with the values of `Scales` as prior medians."""
-    first = np.log(np.array(list(vars(Scales()).values())))
-    received = np.isfinite(readings.powers)
-    outwards = np.argsort(np.linalg.norm(readings.places - readings.places[0], axis=-1), kind="stable")
-    chosen = []
-    looked_at = 400  # positions of every receiver that are used to learn the scales
-    for r in range(len(readings.receivers)):
-        own = outwards[received[outwards, r]][:looked_at]
-        close = alike(readings.places[own], readings.places[own])
-        by_walls = close * np.outer(root_walls[own, r], root_walls[own, r])
-        chosen.append((close, by_walls, 1 / readings.counts[own, r], left[own, r]))
-
-    width, steps = 0.5, 15  # prior standard deviation of the logarithms of all scales, and the number of optimisation steps
-
-    def negative_log_posterior(logs: np.ndarray) -> tuple[float, np.ndarray]:
-        away = (logs - first) / width
-        total, gradient = 0.5 * np.sum(away**2), away / width
-        room, wall, place, reading = np.exp(2 * logs)
-        for close, by_walls, shares, values in chosen:
-            k = room * close + wall * by_walls
-            k[np.diag_indices(len(values))] += place + reading * shares
-            factor = cho_factor(k, lower=True)
-            weights, inverse = cho_solve(factor, values), cho_solve(factor, np.eye(len(values)))
-            total += 0.5 * values @ weights + np.sum(np.log(np.diag(factor[0])))
-            slope = inverse - np.outer(weights, weights)  # twice the derivative by K
-            own = np.diag(slope)
-            gradient = gradient + np.exp(2 * logs) * [np.sum(slope * close), np.sum(slope * by_walls), own.sum(), own @ shares]
-        return float(total), gradient
-
-    bounds = [(x - 2, x + 2) for x in first]
-    options = {"maxiter": steps}
-    found = minimize(negative_log_posterior, first, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    return Scales(*(float(x) for x in np.exp(found.x)))
+def covariance_of_powers(
+    scales: Scales, readings: Readings, root_walls: Float[np.ndarray, "n r"], own: Any, r: int
+) -> Float[np.ndarray, "m m"]:
+    """Returns the covariance (dB^2) of the residuals of the mean powers of the places `own` at receiver r, with their noise."""
+    places, walls = readings.places[own], root_walls[own, r]
+    k = covariance(scales, distances(places, places), walls[:, None], walls)
+    return np.asarray(k) + np.diag(noise(scales, readings.counts[own, r]))

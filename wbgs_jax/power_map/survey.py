@@ -12,7 +12,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.floor_plan import FILES, NO_WALLS, Walls, load_walls
 from wbgs_jax.data.rssi_folder import Readings, cell_means, load_readings
 from wbgs_jax.inference.domain import Domain
-from wbgs_jax.power_map.model import MAX_PLACES
+from wbgs_jax.power_map.model import MAX_PLACES, find_ceilings
 
 HEIGHT_M = 1.3
 """Height of the transmitters above the floor if the readings have no z."""
@@ -88,14 +88,7 @@ def load_survey(folder: Path, height_m: float = HEIGHT_M, cell_m: float = CELL_M
         cells = cell_means(readings, cell_m, STOREY_M)
     walls = find_walls(folder, floor_plan)
     _check_plan(f"floor plan of {folder}" if floor_plan is None else f"floor plan {floor_plan}", walls, cells)
-    heights = np.concatenate([cells.places[:, 2], cells.receivers[:, 2]])
-    one_storey = 2.5  # metres: largest difference of heights within one storey
-    if np.ptp(heights) > one_storey:
-        warnings.warn(
-            f"{folder}: heights z range over {np.ptp(heights):.2g} m, but ceilings between storeys do not attenuate in a map; "
-            "use readings and receivers of one storey",
-            stacklevel=2,
-        )
+    _note_storeys(folder, cells)
     return Survey(cells, cell_m, walls)
 
 
@@ -107,6 +100,25 @@ def _note_spacing(folder: Path, places: Float[np.ndarray, "n 3"], cell_m: float)
         warnings.warn(
             f"{folder}: neighbouring places are {apart:.3g} m apart: are these metres? Otherwise convert the positions of "
             "readings, receivers and walls",
+            stacklevel=3,
+        )
+
+
+def _note_storeys(folder: Path, cells: Readings) -> None:
+    """Notes the ceilings that a map takes to lie between the readings, and receivers above or below all readings."""
+    heights, ceilings = cells.places[:, 2], find_ceilings(cells.places[:, 2])
+    if len(ceilings):
+        listed = ", ".join(f"{height:.3g}" for height in ceilings)
+        warnings.warn(
+            f"{folder}: readings lie on {len(ceilings) + 1} storeys; ceilings at z = {listed} m attenuate in the map",
+            stacklevel=3,
+        )
+    one_storey = 2.5  # metres: largest height of a receiver above or below readings of its storey
+    away = np.maximum(cells.receivers[:, 2] - heights.max(), heights.min() - cells.receivers[:, 2])
+    if away.max() > one_storey:
+        warnings.warn(
+            f"{folder}: receiver {away.argmax() + 1} is {away.max():.2g} m above or below all readings; a ceiling in between "
+            "counts as part of its gain",
             stacklevel=3,
         )
 

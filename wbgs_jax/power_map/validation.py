@@ -12,8 +12,6 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -22,7 +20,8 @@ from wbgs_jax._util.progress_lines import CountProgress
 from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.data.floor_plan import NO_WALLS, Walls, crossings
 from wbgs_jax.data.rssi_folder import Readings
-from wbgs_jax.power_map.model import APART, MIN_POWERS, NEAREST, Scales, alike, distances, learn_map, noise, received_power
+from wbgs_jax.power_map.model import APART, MIN_POWERS, NEAREST, covariance_of_powers, find_ceilings, fit_law, law_features
+from wbgs_jax.power_map.scales import Scales, alike, distances, learn_scales, noise
 
 BLOCK, FOLDS = 1.0, 40
 """Side of the held-out squares, metres; and the maximum number of folds, into which several squares are combined."""
@@ -152,19 +151,31 @@ SIGNS = {"plan turned": np.array([-1, -1]), "plan mirrored in x": np.array([-1, 
 
 def _mapped(parts: Parts, cells: Readings, walls: Walls) -> tuple[Float[np.ndarray, "n r"], Float[np.ndarray, "n r"]]:
     """Returns the predictions for each part by maps learned without it, and the standard deviations of the cell means around
-    these. Scales are learned only once, without the largest part."""
-    scales: Scales | None = None
-    mean, spread = (np.full(cells.powers.shape, np.nan) for _ in range(2))
-    places = jnp.asarray(cells.places, jnp.float32)
-    for part in sorted(parts, key=np.sum, reverse=True):
-        learned = learn_map(cells.without(part), walls, scales)  # shapes stay the same, so that one compilation suffices
-        scales = Scales(*(float(x) for x in learned.scales))
-        power, std = (np.asarray(a, float) for a in _received(learned, places))
-        mean[part], spread[part] = power[part], np.sqrt(std**2 + noise(scales, np.maximum(cells.counts, 1)))[part]
-    return mean, spread
+    these. Scales are learned only once, without the largest part.
 
-
-_received = jax.jit(received_power)
+    A Gaussian process without some of its data needs no solution of its own: with Q the inverse covariance of all powers, those
+    of a part follow from all others with covariance (Q_part)^-1 and deviate from them by (Q_part)^-1 (Q powers)_part (Rasmussen
+    and Williams 2006, section 5.4.2, for single values).
+    """
+    features = law_features(cells.places, cells.receivers, walls, find_ceilings(cells.places[:, 2]))
+    root_walls, received = -features[..., 2], np.isfinite(cells.powers)
+    largest = cells.without(max(parts, key=np.sum))
+    law, _ = fit_law(largest, features)
+    scales = learn_scales(largest, root_walls, np.where(np.isfinite(largest.powers), largest.powers - features @ law, 0))
+    laws = [fit_law(cells.without(part), features) for part in parts]
+    mean, variance = (np.full(cells.powers.shape, np.nan) for _ in range(2))
+    for r, mask in enumerate(received.T):
+        own = np.flatnonzero(mask)
+        inverse = np.linalg.inv(covariance_of_powers(scales, cells, root_walls, own, r))
+        for part, (law, law_covariance) in zip(parts, laws, strict=True):
+            out = part[own]
+            if out.any():
+                off = inverse[out] @ (cells.powers[own, r] - features[own, r] @ law)
+                of_part, rows = np.linalg.inv(inverse[np.ix_(out, out)]), own[out]
+                mean[rows, r] = cells.powers[rows, r] - of_part @ off
+                of_law = np.einsum("bi,ij,bj->b", features[rows, r], law_covariance, features[rows, r])
+                variance[rows, r] = np.diag(of_part) + of_law
+    return mean, np.sqrt(variance)
 
 
 def log_distance(measured: Readings) -> Float[np.ndarray, "n r"]:
@@ -188,7 +199,7 @@ def inverse_distance(measured: Readings) -> Float[np.ndarray, "n r"]:
 def kriging(measured: Readings) -> Float[np.ndarray, "n r"]:
     """Returns the predictions of a separate Gaussian process for each receiver, around its mean power."""
     scales, predicted = Scales(), np.full(measured.powers.shape, np.nanmean(measured.powers))
-    k = APART**2 * alike(measured.places, measured.places)
+    k = APART**2 * alike(distances(measured.places, measured.places))
     for r, mask in enumerate(np.isfinite(measured.powers).T):
         own = np.flatnonzero(mask)
         if len(own):
