@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.synthetic import tiny_dataset
@@ -102,6 +103,24 @@ def test_blocks_alone_decide_and_give_the_intervals(learned, alone):
     assert few.confidence is not None and (few.mixture is None) == alone
     frequencies = () if alone else np.unique(dataset.frequencies_hz[training_links(dataset)])
     np.testing.assert_allclose(few.confidence.frequency_hz, frequencies, rtol=1e-6)
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_intervals_measure_distances_as_queries_do(learned, monkeypatch, together):
+    """To transmitters of any frequency; spectra that are used at all frequencies have intervals at all."""
+    fitted = []
+    confidence_of = cross_validation.confidence_of
+    monkeypatch.setattr(cross_validation, "confidence_of", lambda *own: fitted.append(own) or confidence_of(*own))
+    if together:
+        start = start_mixture
+        nan = jnp.full(len(training_links(tiny_dataset(15))), jnp.nan)
+        monkeypatch.setitem(globals(), "start_mixture", lambda *own: dataclasses.replace(start(*own), frequency_hz=nan))
+    dataset, few, held = learned(False, 50.0)
+    known = dataset.tx_positions[training_links(dataset)]
+    pairs = zip(held.links, held.known, strict=True)
+    away = [np.linalg.norm(known[use] - dataset.tx_positions[link], axis=1).min() for link, use in pairs]
+    np.testing.assert_allclose(np.exp(fitted[0][0][:, 0]), np.hypot(away, 0.01), rtol=1e-6)
+    assert len(few.confidence.frequency_hz) == (0 if together else len(np.unique(dataset.frequencies_hz)))
 
 
 def test_links_without_measurements_at_their_frequency_give_no_intervals(learned):

@@ -1,5 +1,6 @@
 """The share of a field beside simple methods: what held-out spectra prove, and nothing else."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 from builders.synthetic import tiny_dataset
 
 from wbgs_jax._util.statistics import lower_bound
-from wbgs_jax.data.splits import hold_out_validation, training_links
+from wbgs_jax.data.splits import fewer_transmitters, hold_out_validation, keep_links, training_links
 from wbgs_jax.fields.mixture import SHARES
 from wbgs_jax.inference.kriging import mixed_spectra
 from wbgs_jax.metrics import ssim
@@ -25,6 +26,7 @@ from wbgs_jax.training.fit_mixture import (
     left_out,
     moments_of,
     predict_members,
+    scattered,
     ssim_of,
 )
 
@@ -108,6 +110,37 @@ def test_kriging_is_chosen_where_transmitters_have_unequal_numbers_of_frequencie
     monkeypatch.setattr(module, "ssim_of", lambda *_: jnp.asarray(scores))
     found = module._kriged(members, dataset, known, index, np.ones((len(index), len(known.links)), bool))
     assert float(found.length) == pytest.approx(module._reach(dataset.tx_positions[known.links])[1])
+
+
+def at_frequencies(dataset, hertz):
+    """One link of every transmitter, with another frequency; spectra of an array in wavelengths do not depend on it."""
+    one = keep_links(dataset, np.flatnonzero(dataset.frequencies_hz == dataset.frequencies_hz[0]))
+    return dataclasses.replace(one, frequencies_hz=np.resize(hertz, len(one)))
+
+
+@pytest.mark.parametrize("channels", [1, 7, 20])
+def test_transmitters_of_different_channels_explain_each_other(dataset, channels):
+    hopping = at_frequencies(dataset, 902e6 + 1e6 * np.arange(channels))
+    links = training_links(hopping)
+    known = Known(links, hopping.eight_bit(links))
+    found = learn_members(hopping, known)
+    assert scattered(hopping, known) == (channels > 1) == bool(np.isnan(found.frequency_hz).all())
+    together = at_frequencies(dataset, 902e6)
+    expected = learn_members(together, known)
+    truth = np.asarray(hopping.pas(hopping.test))
+    own, best = (
+        ssim(np.asarray(mixed_spectra(one, jnp.zeros_like(jnp.asarray(truth)), data.query(data.test))), truth).mean()
+        for one, data in ((found, hopping), (expected, together))
+    )
+    assert own > best - 0.02
+
+
+def test_two_transmitters_of_two_frequencies_explain_each_other(dataset):
+    two = at_frequencies(fewer_transmitters(dataset, 2, 0), [1e9, 1.1e9])
+    two = dataclasses.replace(two, frequencies_hz=1e9 + 1e8 * (two.tx_index == two.tx_index[two.train[0]]))
+    known = Known(two.train, two.eight_bit(two.train))
+    assert scattered(two, known) and len(left_out(two, known)[0]) == 0
+    assert np.isnan(learn_members(two, known).frequency_hz).all()
 
 
 def test_no_transmitter_explains_itself(dataset, known):

@@ -19,7 +19,8 @@ The mixture has weights that depend on the distance to the measurements:
 u is the standardised logarithm of d, the distance to the nearest measured transmitter, clipped to the range of the data. The
 simple methods are the mean spectrum, the nearest spectrum, inverse distance weighting, ordinary kriging (Cressie 1993, section
 3.2) with the kernel exp(-|x - x_j| / L), and line of sight. All except the mean and the line of sight use only measurements at
-the same frequency. The weights are found by cross-validation (training/fit_mixture.py).
+the same frequency, unless few transmitters have a frequency in common: then all frequencies may count as the same. The weights
+are found by cross-validation (training/fit_mixture.py).
 """
 
 import dataclasses
@@ -90,6 +91,7 @@ class Mixture:
     tx_position: Float[Array, "m 3"]
     """Metres, world frame."""
     frequency_hz: Float[Array, " m"]
+    """NaN if spectra of all frequencies are used together."""
     images: UInt8[Array, "m 90 360"]
     """255 times the spectra."""
     mean: Float[Array, "90 360"]
@@ -138,8 +140,13 @@ def nearness(
     """Returns the kernel: exp(-distance / length) at equal frequencies, else 0."""
     offset = tx_position[:, None] - known_position[None]
     distance = jnp.sqrt(jnp.sum(offset**2, -1) + 1e-12)  # differentiable at a measured position
-    same = jnp.abs(jnp.log(frequency_hz[:, None] / known_frequency[None])) < SAME_FREQUENCY
+    same = same_frequency(frequency_hz[:, None], known_frequency[None])
     return jnp.where(same, jnp.exp(-distance / length), 0)
+
+
+def same_frequency(a: Float[Array, "*#b"], b: Float[Array, "*#b"]) -> Bool[Array, "*b"]:
+    """Returns whether frequencies count as the same; NaN is the same as all others."""
+    return ~(jnp.abs(jnp.log(a / b)) >= SAME_FREQUENCY)
 
 
 def correct(neighbours: Beside, pas: Float[Array, "b 90 360"], query: Query) -> Float[Array, "b 90 360"]:
@@ -246,7 +253,7 @@ def member_spectra(
         frequency_hz: frequency of the query.
         known: mask of the spectra that may be used.
     """
-    known &= jnp.abs(jnp.log(mixture.frequency_hz / frequency_hz)) < SAME_FREQUENCY
+    known &= same_frequency(mixture.frequency_hz, frequency_hz)
     offset = position - mixture.tx_position
     distance = jnp.where(known, jnp.sqrt(jnp.sum(offset**2, -1) + 1e-12), jnp.inf)  # differentiable at a measured position
     negative, index = jax.lax.top_k(-distance, min(NEAREST, len(distance)))

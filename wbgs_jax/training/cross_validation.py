@@ -202,6 +202,15 @@ def _confidence(dataset: Dataset, held: HeldOut, found: Found) -> Confidence | N
     trained = jnp.asarray(np.unique(dataset.tx_positions[training_links(dataset)], axis=0), jnp.float32)
     inputs = features(jnp.asarray(found.answers[measured], jnp.float32), dataset.query(index), receiver.position, trained)
     known = np.array(inputs, np.float64)
-    known[:, 0] = 0.5 * np.log(found.distance[measured] ** 2 + 1e-4)  # distances to the transmitters that were not left out
-    corrected_hz = () if found.alone else np.unique(dataset.frequencies_hz[training_links(dataset)])
+    known[:, 0] = 0.5 * np.log(_distances(dataset, held)[measured] ** 2 + 1e-4)
+    everywhere = found.alone or bool(np.isnan(found.mixture.frequency_hz).all())
+    corrected_hz = () if everywhere else np.unique(dataset.frequencies_hz[training_links(dataset)])
     return confidence_of(known, found.scores[measured], dataset.tx_index[index], receiver.position, trained, corrected_hz)
+
+
+def _distances(dataset: Dataset, held: HeldOut) -> Float[np.ndarray, " n"]:
+    """Returns the distances (metres) of held-out links to the nearest transmitter that was not left out, at any frequency, as
+    queries measure them."""
+    places = dataset.tx_positions[training_links(dataset)]
+    pairs = zip(dataset.tx_positions[held.links], held.known, strict=True)
+    return np.array([np.linalg.norm(places[use] - place, axis=-1).min(initial=np.inf) for place, use in pairs])

@@ -23,7 +23,15 @@ from scipy.special import expit, logit
 from wbgs_jax._util.statistics import lower_bound, standard_error
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields.mixture import SHARES, USUAL_SPREAD, score_at, similarity
-from wbgs_jax.inference.kriging import LOG_METRE, MEMBERS, Mixture, member_spectra, member_weights, scaled_distance
+from wbgs_jax.inference.kriging import (
+    LOG_METRE,
+    MEMBERS,
+    SAME_FREQUENCY,
+    Mixture,
+    member_spectra,
+    member_weights,
+    scaled_distance,
+)
 from wbgs_jax.training.fit_kriging import spacing
 
 STRIDE = 8
@@ -200,10 +208,47 @@ def simple_answers(
 
 def learn_members(dataset: Dataset, known: Known) -> Mixture:
     """Returns the mixture of simple methods that predicts measured spectra best from others, near and far; the weight of the
-    field is zero."""
+    field is zero. If few transmitters have a frequency in common, spectra of all frequencies are used together where that is
+    better."""
+    apart = _members(dataset, known, False)
+    if not scattered(dataset, known):
+        return apart
+    together = _members(dataset, known, True)
+    index, kept = left_out(dataset, known)
+    # Of most transmitters nothing can be predicted at their own frequency alone, or it is predicted worse.
+    few = 2 * len(np.unique(dataset.tx_index[index])) < len(np.unique(dataset.tx_index[known.links]))
+    if few or _score(together, dataset, known, index, kept) > _score(apart, dataset, known, index, kept):
+        return together
+    return apart
+
+
+def scattered(dataset: Dataset, known: Known) -> bool:
+    """Returns whether most measured spectra have a frequency at which at most half of the transmitters were measured."""
+    hertz, which = np.unique(dataset.frequencies_hz[known.links], return_inverse=True)
+    group = np.cumsum(np.diff(np.log(hertz), prepend=np.log(hertz[0])) >= SAME_FREQUENCY)[which]
+    tx = np.unique(dataset.tx_index[known.links], return_inverse=True)[1]
+    pairs = np.unique(np.stack([group, tx]), axis=1)
+    share = np.bincount(pairs[0])[group] / (tx.max() + 1)
+    return bool(np.median(share) <= 0.5)
+
+
+def _score(
+    mixture: Mixture, dataset: Dataset, known: Known, index: Int[np.ndarray, " n"], kept: Bool[np.ndarray, "n m"]
+) -> float:
+    """Returns the mean SSIM of the simple methods for links that are left out."""
+    spectra, distance = predict_members(mixture, dataset, known, index, kept)
+    moments = moments_of(spectra, np.asarray(dataset.pas(index)))
+    found = np.asarray(ssim_of(moments, member_weights(mixture, jnp.asarray(distance))))
+    return standard_error(found, dataset.tx_index[index])[0]
+
+
+def _members(dataset: Dataset, known: Known, together: bool) -> Mixture:
+    """Returns the mixture of simple methods that use only spectra of the same frequency, or of all frequencies together."""
     positions = dataset.tx_positions[known.links]
     mixture = start_mixture(dataset, known, _reach(positions)[0])
-    index, kept = left_out(dataset, known)
+    if together:
+        mixture = dataclasses.replace(mixture, frequency_hz=jnp.full_like(mixture.frequency_hz, jnp.nan))
+    index, kept = left_out(dataset, known, together)
     if not len(index):
         return mixture
     truth = np.asarray(dataset.pas(index))
@@ -244,8 +289,9 @@ def _kriged(
     return dataclasses.replace(mixture, length=jnp.float32(length), nugget=jnp.float32(nugget))
 
 
-def left_out(dataset: Dataset, known: Known) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, "n m"]]:
-    """Returns measured links that are left out, and masks of the other links that may be used for each."""
+def left_out(dataset: Dataset, known: Known, together: bool = False) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, "n m"]]:
+    """Returns measured links that are left out, and masks of the other links that may be used for each. Unless spectra of all
+    frequencies are used together, links without others at their frequency are not left out."""
     rng = np.random.default_rng(2)
     positions, tx = dataset.tx_positions[known.links], dataset.tx_index[known.links]
     places = {number: positions[tx == number][0] for number in np.unique(tx)}
@@ -257,7 +303,7 @@ def left_out(dataset: Dataset, known: Known) -> tuple[Int[np.ndarray, " n"], Boo
         same = np.isclose(dataset.frequencies_hz[known.links], dataset.frequencies_hz[known.links[place]], rtol=1e-4)
         for count in sorted({int(share * len(others)) for share in shares_left_out}):
             use = np.isin(tx, others[count:])
-            if (use & same).any():
+            if (use & (same | together)).any():
                 chosen.append(known.links[place])
                 kept.append(use)
         if len(chosen) >= LEFT_OUT:
