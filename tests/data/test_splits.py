@@ -5,24 +5,28 @@ import warnings
 
 import numpy as np
 import pytest
-from builders.synthetic import FREQUENCIES_HZ, RECEIVERS, tiny_dataset
+from builders.synthetic import FREQUENCIES_HZ, RECEIVERS, tiny_dataset, tiny_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.data import scene_dataset
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import (
     fewer_transmitters,
+    group_places,
     group_transmitters,
     hold_out_box,
     hold_out_validation,
     note_shared_transmitters,
+    places_of,
     select_frequencies,
     select_receivers,
     tx_disjoint_split,
     unseen_frequencies,
     without_test,
 )
+from wbgs_jax.training.cross_validation import is_few
 from wbgs_jax.training.fit_kriging import spacing
 from wbgs_jax.types import make_receiver, stack_receivers
 
@@ -280,3 +284,32 @@ def test_repeated_positions_with_jitter_are_noted(rng):
         )
     np.testing.assert_allclose(spacing(repeated), spacing(places), rtol=0.1)
     assert spacing(places[:2] * 1e-4) < 1e-3
+
+
+def test_places_measured_again_are_not_divided(rng):
+    """Repeats up to millimetres: a random half of them would reveal what the other half measures."""
+    places = np.repeat(rng.uniform(-3, 3, (20, 3)), 5, 0)
+    scene = tiny_scene(100)
+    dataset = scene_dataset(dataclasses.replace(scene, tx_positions=places + rng.normal(0, 1e-3, places.shape)))
+    assert len(np.unique(dataset.tx_index)) == 100
+    place = places_of(dataset)
+    assert len(np.unique(place)) == 20
+    for one in np.unique(place):
+        assert np.ptp(dataset.tx_positions[place == one], axis=0).max() < 0.01
+    held = hold_out_validation(dataset)
+    assert len(held.validation) and not np.isin(place[held.validation], place[held.train]).any()
+    assert is_few(held)
+
+
+def test_dense_places_and_chance_repeats_are_no_places_measured_again(rng):
+    tx = np.arange(60)
+    alone = rng.uniform(-3, 3, (60, 3))
+    track = np.linspace(0, 0.3, 60)[:, None] * [1.0, 0, 0]
+    grid = np.stack([*np.meshgrid(np.arange(10) / 1000, np.arange(6) / 1000), np.zeros((6, 10))], -1).reshape(-1, 3)
+    chance = alone.copy()
+    chance[1] = chance[0] + 0.002
+    for positions in (alone, track, grid, chance, alone[:1], alone[:0]):
+        np.testing.assert_array_equal(group_places(positions, tx[: len(positions)]), tx[: len(positions)])
+    both = np.concatenate([track, np.repeat(alone[:10], 4, 0) + rng.normal(0, 1e-4, (40, 3))])
+    found = group_places(both, np.arange(100))
+    assert len(np.unique(found[:60])) == 60 and len(np.unique(found[60:])) == 10

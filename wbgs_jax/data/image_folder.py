@@ -38,7 +38,7 @@ from wbgs_jax.data.conventions import CONVENTIONS, ConventionName, Evidence, arr
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import check_surroundings, materials_of, scene_dataset
 from wbgs_jax.data.scene_file import Room, SceneFile, check_mesh, load_room
-from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters, tx_disjoint_split
+from wbgs_jax.data.splits import group_places, group_transmitters, note_shared_transmitters, tx_disjoint_split
 from wbgs_jax.mesh.bodies import share_in_box
 from wbgs_jax.mesh.ply import read_ply, write_ply
 from wbgs_jax.observation_kinds import KINDS
@@ -178,7 +178,7 @@ def load_layout(
     if any((folder / name).exists() for name in INDEX.values()):
         split = _read_split(folder, tx_index, positions)
     else:
-        train, test = tx_disjoint_split(tx_index, test_fraction, seed)
+        train, test = tx_disjoint_split(group_places(positions, tx_index), test_fraction, seed)
         split = {"train": train, "validation": train[:0], "test": test}
     trained = np.sort(np.concatenate([split["train"], split["validation"]]))
     shown = images[trained], make_receiver(gateway.position, gateway.orientation), positions[trained], tx_index[trained]

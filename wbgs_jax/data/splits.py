@@ -10,6 +10,8 @@ from collections.abc import Mapping, Sequence
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from wbgs_jax._util.errors import UserError
@@ -19,6 +21,8 @@ VALIDATION = 0.1
 """Fraction of the training transmitters used for validation, unless the data specify a validation part."""
 FEWEST = 4
 """Minimum number of training transmitters of which some are held out for validation."""
+SAME_PLACE_M = 1e-2
+"""Distance up to which a transmitter repeats the position of another, metres."""
 
 
 def group_transmitters(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
@@ -26,6 +30,38 @@ def group_transmitters(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "
     micrometre."""
     _, first, group = np.unique(np.round(positions, 6), axis=0, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[group.reshape(-1)]
+
+
+def group_places(positions: Float[np.ndarray, "n 3"], tx_index: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Returns the place of every link: the lowest index of the transmitters there. A place that was measured again, up to a
+    centimetre, is one place; links of such repeats are no independent samples, and would reveal each other if a split divided
+    them.
+
+    Dense tracks and grids, whose places also lie within a centimetre of each other, are not joined, and neither are places of
+    which only a few happen to lie that close.
+    """
+    transmitters, first = np.unique(tx_index, return_index=True)
+    points = positions[first]
+    pairs = cKDTree(points).query_pairs(SAME_PLACE_M, output_type="ndarray")
+    often = 0.1  # fraction of the transmitters that have to be repeats
+    if len(np.unique(pairs)) <= often * len(points):
+        return tx_index
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
+    count, group = connected_components(links, directed=False)
+    most = 2 * SAME_PLACE_M  # largest extent of a place, along every axis
+    extent = [np.ptp(points[group == one], axis=0).max() for one in range(count)]
+    lowest = np.full(count, len(points))
+    np.minimum.at(lowest, group, np.arange(len(points)))
+    joined = np.where(np.array(extent)[group] <= most, lowest[group], np.arange(len(points)))
+    if len(np.unique(joined)) < FEWEST:
+        return tx_index
+    places: Int[np.ndarray, " n"] = transmitters[joined][np.searchsorted(transmitters, tx_index)]
+    return places
+
+
+def places_of(dataset: Dataset) -> Int[np.ndarray, " n"]:
+    """Returns the place of every link of a dataset (`group_places`): the independent samples of all statistics."""
+    return group_places(dataset.tx_positions, dataset.tx_index)
 
 
 def note_shared_transmitters(
@@ -40,12 +76,11 @@ def note_shared_transmitters(
             text = f"{name}: {shared} TX positions are both in {first} and in {second}; scores will be too high"
             warnings.warn(text, stacklevel=4)
     own, others = (np.unique(positions[split[part]], axis=0) for part in ("test", "train"))
-    # Distance of a repeated position, and fraction and number of test positions that may be repeated.
-    apart_m, few, fewest = 1e-2, 0.1, 4
+    few, fewest = 0.1, 4  # fraction and number of test positions that may be repeated
     if len(own) > fewest and len(others):
         away, _ = cKDTree(others).query(own)
         # Positions that agree to a micrometre belong to one transmitter (the first warning).
-        repeated = (away < apart_m) & (away > 1e-6)
+        repeated = (away < SAME_PLACE_M) & (away > 1e-6)
         if repeated.sum() > fewest and repeated.mean() > few:
             text = f"{name}: {100 * repeated.mean():.0f} % of the test's TX positions lie within 1 cm of one in train"
             warnings.warn(f"{text}; scores will be too high: give all of them the same position", stacklevel=4)
@@ -69,7 +104,8 @@ def tx_disjoint_split(
 def hold_out_validation(dataset: Dataset, fraction: float = VALIDATION) -> Dataset:
     """Returns the dataset with `fraction` of its training transmitters moved to the validation part. If these are fewer than
     eight, eight are moved, but no more than about a quarter, since fewer would decide nothing. Of fewer than `FEWEST` none is
-    moved unless `fraction` is at least one of them: calibration needs them all, and a single one decides nothing.
+    moved unless `fraction` is at least one of them: calibration needs them all, and a single one decides nothing. Transmitters
+    at one place (`group_places`) count as one.
 
     The choice depends only on the split, not on a run's seed or on what is trained. Data with a validation part of their own
     are unchanged.
@@ -77,7 +113,7 @@ def hold_out_validation(dataset: Dataset, fraction: float = VALIDATION) -> Datas
     Raises:
         UserError: the fraction is not between 0 and 1.
     """
-    tx_index = dataset.tx_index[dataset.train]
+    tx_index = group_places(dataset.tx_positions[dataset.train], dataset.tx_index[dataset.train])
     transmitters = np.unique(tx_index)
     if len(dataset.validation) or len(transmitters) < 2:
         return dataset

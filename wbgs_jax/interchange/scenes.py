@@ -7,7 +7,7 @@ from jaxtyping import Complex, Float, Inexact
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import TEST, TRAIN, Room, SceneFile
-from wbgs_jax.data.splits import group_transmitters, tx_disjoint_split
+from wbgs_jax.data.splits import group_places, group_transmitters, tx_disjoint_split
 from wbgs_jax.interchange.ray_paths import RayPaths, carrier, directions_of
 
 FEWEST = 5
@@ -111,7 +111,7 @@ def scene_of_snapshots(
         )
     if not np.iscomplexobj(snapshots):
         raise UserError(f"the snapshots of {name} are real; give complex voltages, not magnitudes or powers")
-    transmitter = group_transmitters(tx_positions)  # repeated measurements at one position count once
+    transmitter = group_places(tx_positions, group_transmitters(tx_positions))  # repeated measurements at one place count once
     if (places := len(np.unique(transmitter))) < FEWEST:
         raise UserError(f"{name} has {places} transmitters, but training needs {FEWEST}")
     split = np.full(count, TRAIN, np.int8)

@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int
 from wbgs_jax._util.files import atomic_write, read_arrays
 from wbgs_jax.config import Settings
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.splits import VALIDATION, training_links
+from wbgs_jax.data.splits import VALIDATION, places_of, training_links
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.intervals import Confidence, features
@@ -76,7 +76,7 @@ def held_out_blocks(
         say: called with a description of each stage.
     """
     known, place = training_links(dataset), folder / FOLDER
-    block = blocks(dataset.tx_positions[known], dataset.tx_index[known])
+    block = blocks(dataset.tx_positions[known], places_of(dataset)[known])
     count = int(block.max()) + 1
     if count < 2:
         return HeldOut(known[:0], np.zeros((0, 90, 360), np.float32), np.zeros((0, len(known)), bool), known[:0])
@@ -154,7 +154,7 @@ class Few(NamedTuple):
 
 def is_few(dataset: Dataset) -> bool:
     """Returns whether a dataset has so few spectra that simple methods are part of the mixture."""
-    held, known = (len(np.unique(dataset.tx_index[links])) for links in (dataset.validation, training_links(dataset)))
+    held, known = (len(np.unique(places_of(dataset)[links])) for links in (dataset.validation, training_links(dataset)))
     enough = 20  # validation transmitters, from which on the validation part alone is sufficient
     few = held < enough and known * VALIDATION < enough
     return dataset.has_spectra and dataset.n_receivers == 1 and few
@@ -166,6 +166,7 @@ def learn_few(field: Field, params: Params, dataset: Dataset, training: Training
     if not len(dataset.validation) and not no_paths:
         return Few(None, None, "no links were held out: the field, which predicts paths, is used alone")
     known, held = cross_validated(field, params, dataset, training, say)
+    dataset = dataclasses.replace(dataset, tx_index=places_of(dataset))  # no paths are looked up below
     found = learn_mixture(dataset, known, held, with_paths=not no_paths)
     if found.alone and not no_paths:
         return Few(None, None, found.line)
@@ -188,7 +189,7 @@ def _validation(field: Field, params: Params, dataset: Dataset, known: Int[np.nd
     index = dataset.validation
     pas = as_observed(field, params, predict_spectra(field, params, dataset, index)) if len(index) else np.zeros((0, 90, 360))
     trained = np.isin(known, dataset.train)
-    return HeldOut(index, pas.astype(np.float32), np.tile(trained, (len(index), 1)), dataset.tx_index[index])
+    return HeldOut(index, pas.astype(np.float32), np.tile(trained, (len(index), 1)), places_of(dataset)[index])
 
 
 def _confidence(dataset: Dataset, held: HeldOut, found: Found) -> Confidence | None:

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.splits import places_of
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.intervals import (
@@ -55,7 +56,7 @@ def learn_confidence(
         dataset: data that it was trained on.
         neighbours: residual kriging from the training part alone, if it is used.
     """
-    if len(dataset.validation) < FEWEST or len(np.unique(dataset.tx_index[dataset.validation])) < 2:
+    if len(dataset.validation) < FEWEST or len(np.unique(places_of(dataset)[dataset.validation])) < 2:
         return None, None
     index = np.random.default_rng(1).permutation(dataset.validation)[:MOST]
     seen = observe_links(field, params, dataset, index)
@@ -80,7 +81,7 @@ def _of_spectra(
     alike = ssim(as_observed(field, params, pas), np.asarray(dataset.pas(index)))
     places = dataset.receivers.position if dataset.n_receivers > 1 else dataset.receiver().position
     corrected_hz = () if neighbours is None else np.unique(neighbours.frequency_hz)
-    return confidence_of(known, alike, dataset.tx_index[index], places, trained, corrected_hz)
+    return confidence_of(known, alike, places_of(dataset)[index], places, trained, corrected_hz)
 
 
 def confidence_of(
@@ -112,16 +113,17 @@ def _of_powers(seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"]
     if truth is None or seen.power_db is None:
         return None
     received = np.flatnonzero(truth > NO_PATH_DB)
-    if len(received) < FEWEST or len(np.unique(dataset.tx_index[index[received]])) < 2:
+    if len(received) < FEWEST or len(np.unique(places_of(dataset)[index[received]])) < 2:
         return None
     index, predicted = index[received], np.asarray(seen.power_db)[received]
     receivers = jnp.asarray(dataset.rx_positions(index), jnp.float32)
     trained = _trained(dataset)
     known = np.asarray(_power_features(jnp.asarray(predicted), dataset.query(index), receivers, trained), np.float64)
     error = np.log(POWER_MARGIN_DB + np.abs(predicted.astype(np.float64) - truth[received]))
-    *learned, rest = fit(known, error, dataset.tx_index[index], POWER_SETS)
-    level = exact_level(dataset.tx_index[index])
-    arrays = *learned, upper_end(rest, dataset.tx_index[index], 1 - level), np.exp(rest).mean(), level
+    places = places_of(dataset)[index]
+    *learned, rest = fit(known, error, places, POWER_SETS)
+    level = exact_level(places)
+    arrays = *learned, upper_end(rest, places, 1 - level), np.exp(rest).mean(), level
     return PowerConfidence(trained, *(jnp.asarray(array, jnp.float32) for array in arrays))
 
 

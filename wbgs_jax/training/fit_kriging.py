@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.splits import training_links
+from wbgs_jax.data.splits import places_of, training_links
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.kriging import Neighbours
@@ -72,7 +72,7 @@ def learn_neighbours(field: Field, params: Params, dataset: Dataset) -> Learned:
     if why := _why_not(dataset, len(links)):
         return Learned(line=f"no residual kriging: {why}")
     queried = np.random.default_rng(0).permutation(dataset.validation)[:SCORED]
-    truth, tx = np.asarray(dataset.pas(queried)), dataset.tx_index[queried]
+    truth, tx = np.asarray(dataset.pas(queried)), places_of(dataset)[queried]
     own = predict_spectra(field, params, dataset, queried)
 
     def alike(pas: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, " n"]:
@@ -94,7 +94,7 @@ def _why_not(dataset: Dataset, known: int) -> str:
     """Returns the reason why residual kriging cannot be used for a dataset; empty if it can."""
     if dataset.n_receivers > 1:
         return "the data have several receivers"
-    held_out = len(np.unique(dataset.tx_index[dataset.validation]))
+    held_out = len(np.unique(places_of(dataset)[dataset.validation]))
     if held_out < FEWEST:
         return f"{held_out} validation transmitters are too few to measure its gain"
     return f"{known:,} measured spectra are more than {MOST:,}" if known > MOST else ""
