@@ -21,8 +21,6 @@ VALIDATION = 0.1
 """Fraction of the training transmitters used for validation, unless the data specify a validation part."""
 FEWEST = 4
 """Minimum number of training transmitters of which some are held out for validation."""
-SAME_PLACE_M = 1e-2
-"""Distance up to which a transmitter repeats the position of another, metres."""
 
 
 def group_transmitters(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
@@ -34,26 +32,28 @@ def group_transmitters(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "
 
 def group_places(positions: Float[np.ndarray, "n 3"], tx_index: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
     """Returns the place of every link: the lowest index of the transmitters there. A place that was measured again, up to a
-    centimetre, is one place; links of such repeats are no independent samples, and would reveal each other if a split divided
-    them.
+    centimetre or two, is one place; links of such repeats are no independent samples, and would reveal each other if a split
+    divided them.
 
-    Dense tracks and grids, whose places also lie within a centimetre of each other, are not joined, and neither are places of
-    which only a few happen to lie that close.
+    Places have to be well apart: those of dense tracks and grids are different places. Neither are transmitters joined if only
+    a few happen to lie that close.
     """
     transmitters, first = np.unique(tx_index, return_index=True)
     points = positions[first]
-    pairs = cKDTree(points).query_pairs(SAME_PLACE_M, output_type="ndarray")
-    often = 0.1  # fraction of the transmitters that have to be repeats
+    apart_m, most_m, often = 5e-2, 2e-2, 0.1  # least distance between places, extent of a place, and fraction of repeats
+    pairs = cKDTree(points).query_pairs(apart_m, output_type="ndarray")
     if len(np.unique(pairs)) <= often * len(points):
         return tx_index
     links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
     count, group = connected_components(links, directed=False)
-    most = 2 * SAME_PLACE_M  # largest extent of a place, along every axis
-    extent = [np.ptp(points[group == one], axis=0).max() for one in range(count)]
-    lowest = np.full(count, len(points))
+    lowest, low, high = np.full(count, len(points)), np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     np.minimum.at(lowest, group, np.arange(len(points)))
-    joined = np.where(np.array(extent)[group] <= most, lowest[group], np.arange(len(points)))
-    if len(np.unique(joined)) < FEWEST:
+    np.minimum.at(low, group, points)
+    np.maximum.at(high, group, points)
+    small = (high - low).max(1) <= most_m
+    repeated = small[group] & (np.bincount(group)[group] > 1)
+    joined = np.where(small[group], lowest[group], np.arange(len(points)))
+    if repeated.mean() <= often or len(np.unique(joined)) < FEWEST:
         return tx_index
     places: Int[np.ndarray, " n"] = transmitters[joined][np.searchsorted(transmitters, tx_index)]
     return places
@@ -76,11 +76,12 @@ def note_shared_transmitters(
             text = f"{name}: {shared} TX positions are both in {first} and in {second}; scores will be too high"
             warnings.warn(text, stacklevel=4)
     own, others = (np.unique(positions[split[part]], axis=0) for part in ("test", "train"))
-    few, fewest = 0.1, 4  # fraction and number of test positions that may be repeated
+    # Distance of a repeated position, and fraction and number of test positions that may be repeated.
+    apart_m, few, fewest = 1e-2, 0.1, 4
     if len(own) > fewest and len(others):
         away, _ = cKDTree(others).query(own)
         # Positions that agree to a micrometre belong to one transmitter (the first warning).
-        repeated = (away < SAME_PLACE_M) & (away > 1e-6)
+        repeated = (away < apart_m) & (away > 1e-6)
         if repeated.sum() > fewest and repeated.mean() > few:
             text = f"{name}: {100 * repeated.mean():.0f} % of the test's TX positions lie within 1 cm of one in train"
             warnings.warn(f"{text}; scores will be too high: give all of them the same position", stacklevel=4)
