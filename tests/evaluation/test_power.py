@@ -89,3 +89,20 @@ def test_links_that_nothing_reaches_are_left_out(dataset):
     assert report["baselines"].keys() == {"free_space", "nearest_tx"}
     assert report["baselines"]["nearest_tx"]["power_mae_db"] < 60  # silence lends nothing
     assert power_figures(truth, tiny_dataset(kind="pas"), dataset.test) is None
+
+
+def test_a_receiver_that_heard_nothing_spoils_no_other():
+    """Neither are the nearest transmitters of the others silent, nor does silence count as a prediction."""
+    dataset = tiny_dataset(12, n_rx=3, kind="power")
+    powers = np.array(dataset.power_db)
+    train = np.isin(np.arange(len(dataset)), dataset.train)
+    powers[train & (dataset.receiver_index == 2)] = -250
+    powers[np.flatnonzero(train & (dataset.receiver_index == 0))[::2]] = -250
+    some = dataset.with_observations(power_db=powers)
+    found = nearest_power(some, some.test)
+    assert ((found == -250) == (some.receiver_index[some.test] == 2)).all()
+    zeros = np.zeros(len(some.test), np.float32)
+    assert power_figures(zeros, some, some.test)["baselines"].keys() == {"free_space"}
+    heard = some.test[some.receiver_index[some.test] != 2]
+    report = power_figures(zeros[: len(heard)], some, heard)
+    assert report["baselines"]["nearest_tx"]["power_mae_db"] < 6

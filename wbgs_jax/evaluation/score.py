@@ -142,8 +142,8 @@ def score_power(
 
 def power_figures(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, Any] | None:
     """Returns the report of predicted powers, and that of the baselines: free_space (Friis over the straight line) and, if the
-    receivers have training data, nearest_tx (the power of the nearest training transmitter at the same frequency). None if the
-    data contain no powers.
+    receivers received anything in the training data, nearest_tx (the power of the nearest training transmitter that was
+    received at the same frequency). None if the data contain no powers.
 
     Raises:
         UserError: as `score_power`.
@@ -152,7 +152,8 @@ def power_figures(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: I
     if report is None:
         return None
     others = {"free_space": free_space(dataset, index)}
-    if can_lend(dataset, index):
+    heard = _with_received_training(dataset)
+    if can_lend(heard, index[_received(dataset, index)]):
         others["nearest_tx"] = nearest_power(dataset, index)
     return report | {"baselines": {name: score_received(values, dataset, index) for name, values in others.items()}}
 
@@ -197,13 +198,27 @@ def free_space(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarr
 
 
 def nearest_power(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Returns the power (dB) of the nearest training transmitter that was received at the same frequency and receiver; if a
-    receiver received none, simply of the nearest one."""
-    everything = dataset.received_db(np.arange(len(dataset)))
-    assert everything is not None
-    received = dataset.train[everything[dataset.train] > NO_PATH_DB]
-    all_received = np.isin(dataset.receiver_index[index], dataset.receiver_index[received]).all()
-    return everything[nearest_links(dataset, index, received if all_received else dataset.train)]
+    """Returns the power (dB) of the nearest training transmitter that was received at the same frequency and receiver; silence
+    at receivers that received none."""
+    heard = _with_received_training(dataset)
+    known = np.isin(dataset.receiver_index[index], dataset.receiver_index[heard.train])
+    powers = np.full(len(index), NO_PATH_DB, np.float32)
+    found = dataset.received_db(nearest_links(dataset, index[known], heard.train))
+    assert found is not None
+    powers[known] = found
+    return powers
+
+
+def _received(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Returns on which links something was received."""
+    powers = dataset.received_db(index)
+    assert powers is not None
+    return powers > NO_PATH_DB
+
+
+def _with_received_training(dataset: Dataset) -> Dataset:
+    """Returns a dataset with only those training links on which something was received."""
+    return dataclasses.replace(dataset, train=dataset.train[_received(dataset, dataset.train)])
 
 
 def _summary(error: Float[np.ndarray, " n"]) -> dict[str, Any]:
