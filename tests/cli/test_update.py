@@ -9,10 +9,13 @@ from builders.synthetic import tiny_dataset
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.commands.update import main
-from wbgs_jax.data.load import RELEASED
+from wbgs_jax.data.load import RELEASED, scene_dataset
 from wbgs_jax.data.scene_file import SceneFile, load_scene, save_scene
+from wbgs_jax.inference.intervals import read_confidence, read_power_confidence
 from wbgs_jax.inference.trained_field import RunConfig
-from wbgs_jax.training.update import check_new
+from wbgs_jax.training.calibration.changes import Notice
+from wbgs_jax.training.run_folder import load_trained
+from wbgs_jax.training.update import Update, check_new, with_links, write_run
 
 
 def new_links(path, count, ghz=(2.4, 10.0), **changes) -> SceneFile:
@@ -91,3 +94,20 @@ def test_nothing_is_written_where_nothing_has_changed(tmp_path):
     (line,) = done.out.splitlines()
     assert line.startswith("nothing has changed (p = ")
     assert not (tmp_path / "out").exists()
+
+
+def test_intervals_of_an_updated_run_are_far_from_stale_and_new_places(tmp_path):
+    """The field has learned nothing of the spectra at new places: an answer next to them is as uncertain as before."""
+    trained = load_trained()
+    old = trained.dataset()
+    assert trained.intervals is not None
+    stale = old.tx_positions[:, 0] < np.median(old.tx_positions[:, 0])
+    new = scene_dataset(new_links(tmp_path / "new.npz", 6))
+    new = dataclasses.replace(new, tx_positions=new.tx_positions + 0.05)
+    room = with_links(old, np.flatnonzero(~stale), new)
+    write_run(tmp_path / "run", Update(Notice(0.01, {}), [], 1.0, trained, room, stale, []), old)
+    before = np.asarray(trained.intervals.tx_position)
+    kept = before[before[:, 0] >= np.float32(np.median(old.tx_positions[:, 0])) - 1e-4]
+    for found in (read_confidence(tmp_path / "run"), read_power_confidence(tmp_path / "run")):
+        assert found is not None
+        np.testing.assert_allclose(found.tx_position, kept, atol=1e-3)

@@ -3,7 +3,8 @@
 
 Old links near an affected place are stale. They are left out of the data of the new run, out of the measured spectra that
 correct its predictions, and out of the places from which its prediction intervals take the distance. The regression of the
-intervals is kept: predictions elsewhere are the same as before.
+intervals is kept: predictions elsewhere are the same as before. They are no better next to new links, which neither train the
+field nor correct it, so that these are no such places.
 """
 
 import dataclasses
@@ -27,7 +28,7 @@ from wbgs_jax.data.splits import keep_links, training_links
 from wbgs_jax.fields.base import Ability
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import WaveParams
-from wbgs_jax.inference.intervals import write_confidence
+from wbgs_jax.inference.intervals import C, write_confidence
 from wbgs_jax.inference.kriging import SAME_PLACE_M, some_of, write_neighbours
 from wbgs_jax.inference.predictor import observe_links
 from wbgs_jax.inference.trained_field import TrainedField
@@ -390,13 +391,8 @@ def write_run(folder: Path, update: Update, old: Dataset) -> None:
         metadata = {"limits": None, "seconds": trained.seconds, "data": checksum(config.dataset())}
         checkpoint.save(folder / "checkpoints", trained.step, state, trained.field, metadata, 1)
         write_neighbours(folder, _without_places(trained.correction, old.tx_positions[update.stale]))
-        measured = jnp.asarray(np.unique(dataset.tx_positions[dataset.train], axis=0), jnp.float32)
-        spectra, powers = trained.intervals, trained.power_intervals
-        write_confidence(
-            folder,
-            spectra and dataclasses.replace(spectra, tx_position=measured),
-            powers and dataclasses.replace(powers, tx_position=measured),
-        )
+        stale = old.tx_positions[update.stale]
+        write_confidence(folder, _far_from(trained.intervals, stale), _far_from(trained.power_intervals, stale))
         changes = [dataclasses.asdict(one) for one in update.changes]
         test = {"p_value": update.notice.p_value, "p_values": update.notice.p_values}
         write_json(folder / RECORD, test | {"changes": changes, "gain_db": update.gain_db, "lines": lines_of(update, old)})
@@ -409,6 +405,14 @@ def _without_places(correction: Any, stale: Float[np.ndarray, "n 3"]) -> Any:
         return correction
     away = cKDTree(stale).query(np.asarray(correction.tx_position))[0]
     return some_of(correction, np.flatnonzero(away > SAME_PLACE_M))
+
+
+def _far_from(intervals: C | None, stale: Float[np.ndarray, "n 3"]) -> C | None:
+    """Returns a regression without stale places, unless none would remain."""
+    if intervals is None or not len(stale):
+        return intervals
+    away = cKDTree(stale).query(np.asarray(intervals.tx_position))[0] > SAME_PLACE_M
+    return dataclasses.replace(intervals, tx_position=intervals.tx_position[away]) if away.any() else intervals
 
 
 def scene_of(dataset: Dataset, source: str) -> SceneFile:
