@@ -22,6 +22,7 @@ from wbgs_jax.training.calibration.changes import (
     notice,
     objects_of,
     power_change_db,
+    samples_of,
     with_object_moved,
     without_object,
 )
@@ -60,6 +61,15 @@ def test_false_alarms_have_the_given_rate(rng, monkeypatch):
     found = np.array([notice(evidence(rng, 15), rng).p_value for _ in range(150)])
     assert np.mean(found <= 0.05) < 0.12  # 0.05 + 4 standard errors
     assert 0.3 < found.mean() < 0.7
+
+
+def test_places_measured_again_are_one_sample(rng):
+    """As many samples as repeats would make one badly predicted place a change; old and new ones stay apart."""
+    old = rng.uniform(0, 5, (8, 3))
+    new = np.repeat(np.concatenate([old[:1], rng.uniform(0, 5, (4, 3))]), 3, 0) + rng.normal(0, 1e-3, (15, 3))
+    group = np.repeat([Group.OLD, Group.NEW], [8, 15])
+    found = samples_of(np.concatenate([old, new]), np.arange(23), group)
+    np.testing.assert_array_equal(found, [*range(8), *np.repeat(8 + 3 * np.arange(5), 3)])
 
 
 def test_a_large_change_is_noticed(rng):

@@ -24,7 +24,7 @@ from wbgs_jax._util.files import write_json
 from wbgs_jax.data.dataset import Dataset, checksum
 from wbgs_jax.data.load import PARTS, source_paths
 from wbgs_jax.data.scene_file import SceneFile, load_scene, save_scene
-from wbgs_jax.data.splits import keep_links, training_links
+from wbgs_jax.data.splits import keep_links, places_of, training_links
 from wbgs_jax.fields.base import Ability
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import WaveParams
@@ -120,7 +120,7 @@ def check_new(new: Dataset, old: Dataset) -> Dataset:
     low, high = old.vertices.min(0) - SAME_PLACE_M, old.vertices.max(0) + SAME_PLACE_M
     if (away := ((new.tx_positions < low) | (new.tx_positions > high)).any(1)).any():
         raise UserError(f"{away.sum()} of {len(new)} links of {new.name} lie outside of the room of {old.name}")
-    if (count := len(np.unique(new.tx_index))) < FEWEST_TX:
+    if (count := len(np.unique(places_of(new)))) < FEWEST_TX:
         raise UserError(f"{new.name} has {count} transmitters; an update needs at least {FEWEST_TX} new ones")
     return dataclasses.replace(new, receivers=old.receivers, receiver_index=number[new.receiver_index])
 

@@ -28,6 +28,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from wbgs_jax._util.statistics import by_transmitter
+from wbgs_jax.data.splits import group_places
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams
 from wbgs_jax.mesh.facets import areas, centres
@@ -154,7 +155,9 @@ def gather(
         group: group of every link.
     """
     score, *without = _without_each(problem, params, objects, NOTICED)
-    transmitters, first, place = np.unique(problem.tx_index(), return_index=True, return_inverse=True)
+    positions = np.asarray(problem.data.links.tx_position, np.float64)[problem.spectra]
+    samples = samples_of(positions, problem.tx_index(), group)
+    transmitters, first, place = np.unique(samples, return_index=True, return_inverse=True)
     count = np.bincount(place)
 
     def by_tx(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " tx"]:
@@ -167,9 +170,20 @@ def gather(
         np.array([by_tx(one) for one in gains]).reshape(-1, len(transmitters)),
         np.array([by_tx(np.maximum(one, 0)) for one in gains]).reshape(-1, len(transmitters)),
         None if power is None else by_tx(power),
-        np.asarray(problem.data.links.tx_position, np.float64)[problem.spectra][first],
+        positions[first],
         group[first],
     )
+
+
+def samples_of(
+    positions: Float[np.ndarray, "n 3"], tx_index: Int[np.ndarray, " n"], group: Int[np.ndarray, " n"]
+) -> Int[np.ndarray, " n"]:
+    """Returns the independent samples that links belong to: transmitters, or places that were measured again in one group."""
+    found = tx_index.copy()
+    for one in np.unique(group):
+        own = group == one
+        found[own] = group_places(positions[own], tx_index[own])
+    return found
 
 
 def _without_each(
