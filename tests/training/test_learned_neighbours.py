@@ -9,7 +9,7 @@ import pytest
 from builders.synthetic import tiny_dataset
 from builders.toys import NoisyField, RippleConfig, RippleField
 
-from wbgs_jax.data.splits import hold_out_validation
+from wbgs_jax.data.splits import hold_out_validation, keep_links
 from wbgs_jax.inference.kriging import correct
 from wbgs_jax.metrics import ssim
 from wbgs_jax.training import fit_kriging as module
@@ -46,6 +46,18 @@ def test_they_are_asked_where_neighbours_are_alike(field, params, rng):
     alone = np.asarray(own(query))
     corrected = np.asarray(correct(neighbours, jnp.asarray(alone), query))
     assert ssim(corrected, truth).mean() > ssim(alone, truth).mean() + 0.2
+
+
+def test_transmitters_of_different_frequencies_are_asked_together(field, params, rng):
+    dataset = alike(tiny_dataset(24), rng, 0.1)
+    assert not any(choice.together for choice in choices(dataset, dataset.train))
+    one = keep_links(dataset, np.flatnonzero(dataset.frequencies_hz == dataset.frequencies_hz[0]))
+    hopping = hold_out_validation(dataclasses.replace(one, frequencies_hz=902e6 + 1e6 * np.arange(len(one))))
+    learned = learn_neighbours(field, params, hopping)
+    assert learned.neighbours is not None and np.isnan(learned.neighbours.frequency_hz).all()
+    own = jnp.full((len(hopping.test), 90, 360), 0.5)
+    corrected = np.asarray(correct(learned.neighbours, own, hopping.query(hopping.test)))
+    assert ssim(corrected, np.asarray(hopping.pas(hopping.test))).mean() > 0.8
 
 
 @pytest.mark.heavy

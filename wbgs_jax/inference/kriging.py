@@ -9,7 +9,8 @@ Residual kriging corrects predicted spectra by measured ones, with simple krigin
 The first form interpolates the residuals of the field; the second interpolates the measured spectra themselves, which helps
 if the field is overfitted to them, so that their residuals are zero. The form, the correlation length L and the weight w are
 selected on the validation part (training/fit_kriging.py), where no correction at all is one of the options. Only the nearest
-measurements are used: they screen the others, and a dataset may have thousands.
+measurements are used: they screen the others, and a dataset may have thousands. If few transmitters have a frequency in common,
+all frequencies may count as the same.
 
 The mixture has weights that depend on the distance to the measurements:
 
@@ -19,8 +20,7 @@ The mixture has weights that depend on the distance to the measurements:
 u is the standardised logarithm of d, the distance to the nearest measured transmitter, clipped to the range of the data. The
 simple methods are the mean spectrum, the nearest spectrum, inverse distance weighting, ordinary kriging (Cressie 1993, section
 3.2) with the kernel exp(-|x - x_j| / L), and line of sight. All except the mean and the line of sight use only measurements at
-the same frequency, unless few transmitters have a frequency in common: then all frequencies may count as the same. The weights
-are found by cross-validation (training/fit_mixture.py).
+the same frequency, with the same exception. The weights are found by cross-validation (training/fit_mixture.py).
 """
 
 import dataclasses
@@ -64,6 +64,7 @@ class Neighbours:
     tx_position: Float[Array, "m 3"]
     """Metres, world frame."""
     frequency_hz: Float[Array, " m"]
+    """NaN if spectra of all frequencies are used together."""
     images: Num[Array, "m 90 360"]
     """y - f in half precision, or 255 y as bytes."""
     scale: Float[Array, ""]

@@ -80,7 +80,8 @@ def _of_spectra(
     known = np.asarray(_features(jnp.asarray(pas), query, receivers, trained, power), np.float64)
     alike = ssim(as_observed(field, params, pas), np.asarray(dataset.pas(index)))
     places = dataset.receivers.position if dataset.n_receivers > 1 else dataset.receiver().position
-    corrected_hz = () if neighbours is None else np.unique(neighbours.frequency_hz)
+    known_hz = np.zeros(0) if neighbours is None else np.asarray(neighbours.frequency_hz)
+    corrected_hz = np.unique(known_hz[np.isfinite(known_hz)])  # NaN corrects at all frequencies
     return confidence_of(known, alike, places_of(dataset)[index], places, trained, corrected_hz)
 
 

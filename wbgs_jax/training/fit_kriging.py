@@ -20,7 +20,7 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import places_of, training_links
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params
-from wbgs_jax.inference.kriging import Neighbours
+from wbgs_jax.inference.kriging import SAME_FREQUENCY, Neighbours
 from wbgs_jax.inference.predictor import as_observed, corrected, predict_spectra
 from wbgs_jax.metrics import ssim
 
@@ -47,6 +47,8 @@ class Choice:
     """Correlation length, metres."""
     weight: float
     """Factor of the interpolated values."""
+    together: bool = False
+    """Whether spectra of all frequencies are used together."""
 
 
 class Learned(NamedTuple):
@@ -138,7 +140,19 @@ def choices(dataset: Dataset, known: Int[np.ndarray, " n"]) -> list[Choice]:
     # Correlation lengths that are tried, relative to the median distance between a training transmitter and the nearest other.
     spacings = (0.5, 1, 2, 4, 8, 16, 32)
     weights = (0.5, 1.0)  # weights of the kriged spectra that are tried
-    return [Choice(kind, scale * metres, weight) for kind, scale, weight in itertools.product(kinds, spacings, weights)]
+    together = (False, True) if scattered(dataset, known) else (False,)
+    tried = itertools.product(kinds, spacings, weights, together)
+    return [Choice(kind, scale * metres, weight, joined) for kind, scale, weight, joined in tried]
+
+
+def scattered(dataset: Dataset, known: Int[np.ndarray, " n"]) -> bool:
+    """Returns whether most of the measured links have a frequency at which at most half of the transmitters were measured."""
+    hertz, which = np.unique(dataset.frequencies_hz[known], return_inverse=True)
+    group = np.cumsum(np.diff(np.log(hertz), prepend=np.log(hertz[0])) >= SAME_FREQUENCY)[which]
+    tx = np.unique(dataset.tx_index[known], return_inverse=True)[1]
+    pairs = np.unique(np.stack([group, tx]), axis=1)
+    share = np.bincount(pairs[0])[group] / (tx.max() + 1)
+    return bool(np.median(share) <= 0.5)
 
 
 def spacing(places: Float[np.ndarray, "n 3"]) -> float:
@@ -191,7 +205,7 @@ def make_neighbours(
         rx_position=dataset.receiver().position,
         rx_orientation=dataset.receiver().orientation,
         tx_position=jnp.asarray(dataset.tx_positions[index], jnp.float32),
-        frequency_hz=jnp.asarray(dataset.frequencies_hz[index], jnp.float32),
+        frequency_hz=jnp.asarray(np.where(choice.together, np.nan, dataset.frequencies_hz[index]), jnp.float32),
         images=images,
         scale=jnp.float32(1 / 255 if spectra else 1.0),
         weight=jnp.float32(choice.weight),

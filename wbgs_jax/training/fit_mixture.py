@@ -26,13 +26,12 @@ from wbgs_jax.fields.mixture import SHARES, USUAL_SPREAD, score_at, similarity
 from wbgs_jax.inference.kriging import (
     LOG_METRE,
     MEMBERS,
-    SAME_FREQUENCY,
     Mixture,
     member_spectra,
     member_weights,
     scaled_distance,
 )
-from wbgs_jax.training.fit_kriging import spacing
+from wbgs_jax.training.fit_kriging import scattered, spacing
 
 STRIDE = 8
 """Stride, in pixels, of the SSIM windows with which mixtures are compared."""
@@ -211,7 +210,7 @@ def learn_members(dataset: Dataset, known: Known) -> Mixture:
     field is zero. If few transmitters have a frequency in common, spectra of all frequencies are used together where that is
     better."""
     apart = _members(dataset, known, False)
-    if not scattered(dataset, known):
+    if not scattered(dataset, known.links):
         return apart
     together = _members(dataset, known, True)
     index, kept = left_out(dataset, known)
@@ -220,16 +219,6 @@ def learn_members(dataset: Dataset, known: Known) -> Mixture:
     if few or _score(together, dataset, known, index, kept) > _score(apart, dataset, known, index, kept):
         return together
     return apart
-
-
-def scattered(dataset: Dataset, known: Known) -> bool:
-    """Returns whether most measured spectra have a frequency at which at most half of the transmitters were measured."""
-    hertz, which = np.unique(dataset.frequencies_hz[known.links], return_inverse=True)
-    group = np.cumsum(np.diff(np.log(hertz), prepend=np.log(hertz[0])) >= SAME_FREQUENCY)[which]
-    tx = np.unique(dataset.tx_index[known.links], return_inverse=True)[1]
-    pairs = np.unique(np.stack([group, tx]), axis=1)
-    share = np.bincount(pairs[0])[group] / (tx.max() + 1)
-    return bool(np.median(share) <= 0.5)
 
 
 def _score(
