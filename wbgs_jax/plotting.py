@@ -16,7 +16,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from wbgs_jax import metrics
 from wbgs_jax._util.cli import point_words
@@ -353,7 +353,7 @@ def draw_responses(found: Mapping[str, np.ndarray], queries: Queries) -> Figure:
     below.set(xlabel="delay, modulo the longest one shown [ns]", ylabel=f"impulse response,\n{unit}")
     if np.isfinite(impulses).any():
         below.set_ylim(np.nanmax(impulses) - FADED_DB, np.nanmax(impulses) + 3)
-    above.legend(fontsize=8)
+    _name_curves(above)
     for axis in (above, below):
         axis.grid(alpha=0.3)
     return figure
@@ -367,7 +367,7 @@ def draw_matrices(matrices: Complex[np.ndarray, "n elements m"], queries: Querie
     elements, columns = matrices.shape[1:]
     for axis, value in zip(axes, values, strict=True):
         shown = axis.imshow(value, cmap=COLORS, aspect="auto", extent=(0.5, columns + 0.5, elements + 0.5, 0.5), **span)
-        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axis.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     _name_axes(axes, "number of the transmitter's element", "number of the receiver's element")
     figure.colorbar(shown, ax=axes, shrink=0.8, label="power of the channel [dB of the transmitted]")
     return figure
@@ -384,10 +384,17 @@ def draw_snapshots(snapshots: Complex[np.ndarray, "n elements"], queries: Querie
         axes[1].plot(numbers, np.degrees(np.angle(values)), **style)
     axes[0].set_ylabel("power [dB of the transmitted]")
     axes[1].set(xlabel="number of the receiver's element", ylabel="phase [deg]", ylim=(-185, 185), yticks=range(-180, 181, 90))
-    axes[0].legend(fontsize=8)
+    _name_curves(axes[0])
     for axis in axes:
         axis.grid(alpha=0.3)
     return figure
+
+
+def _name_curves(axis: Axes, title: str = "") -> None:
+    """Adds a legend, beside the axes if it is so long that it would hide curves."""
+    most_within = 5  # curves
+    beside: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.01, 1), "borderaxespad": 0}
+    axis.legend(fontsize=8, title=title, **beside if len(axis.get_legend_handles_labels()[1]) > most_within else {})
 
 
 def _shares(count: int) -> Float[np.ndarray, " n"]:
@@ -418,6 +425,8 @@ def draw_sweeps(quantity: Quantity, found: Mapping[str, np.ndarray], queries: Qu
         curves, bounds = values, within
     else:
         curves, bounds = np.moveaxis(values, 1, 0), within.T
+    order = np.argsort(places, kind="stable")  # frequencies may be given in any order
+    places, curves, bounds = places[order], curves[:, order], bounds[:, order]
     chosen, label = shown_rows(len(curves)), quantity.label
     joined = "none" if queries.paired or len(places) == 1 else "-"  # a line between single points would mean nothing
     style: dict[str, Any] = {"marker": "o" if joined == "none" else ".", "ms": 5 if joined == "none" else 3, "lw": 1.2}
@@ -437,7 +446,7 @@ def draw_sweeps(quantity: Quantity, found: Mapping[str, np.ndarray], queries: Qu
     if values.shape[-1] > 1:
         label = label.replace("the azimuth", "azimuth (filled) and\nzenith (open, dashed)")
     if legend != [""]:
-        axis.legend(fontsize=8, title="" if len(chosen) == len(curves) else f"{len(chosen)} of {len(curves)}")
+        _name_curves(axis, "" if len(chosen) == len(curves) else f"{len(chosen)} of {len(curves)}")
     axis.set_ylabel(label)
     axis.grid(alpha=0.3)
     return figure
@@ -447,11 +456,10 @@ def _places(axis: Axes, queries: Queries) -> tuple[Float[np.ndarray, " n"], list
     """Names the axis over which a quantity is drawn; returns the places on it, and the words for every curve."""
     if queries.paired:
         axis.set_xlabel("number of the query")
-        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axis.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
         return np.arange(1, len(queries) + 1.0), [""]
     if len(queries.frequencies_hz) > len(queries.tx_positions):
-        axis.set(xlabel="frequency [GHz]", xscale="log")
-        axis.xaxis.set_major_formatter("{x:g}")
+        _name_frequencies(axis, queries.frequencies_hz / 1e9)
         return queries.frequencies_hz / 1e9, [f"TX {point_words(tx)}" for tx in queries.tx_positions]
     steps = np.linalg.norm(np.diff(queries.tx_positions, axis=0), axis=-1)
     first, last = (point_words(queries.tx_positions[i]) for i in (0, -1))
@@ -460,6 +468,16 @@ def _places(axis: Axes, queries: Queries) -> tuple[Float[np.ndarray, " n"], list
     else:
         axis.set_xticks([0.0], [f"TX {first}"])
     return np.concatenate([[0.0], np.cumsum(steps)]), [f"{frequency / 1e9:.4g} GHz" for frequency in queries.frequencies_hz]
+
+
+def _name_frequencies(axis: Axes, ghz: Float[np.ndarray, " n"]) -> None:
+    """Names an axis of frequencies, logarithmic if they span more than a factor of three."""
+    axis.set_xlabel("frequency [GHz]")
+    if ghz.max() > 3 * ghz.min():
+        axis.set_xscale("log")
+        axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.xaxis.set_minor_formatter(NullFormatter())
 
 
 def draw_channel(found: Mapping[str, np.ndarray], source: Mapping[str, Any], frequency_hz: float) -> Figure:
@@ -485,12 +503,13 @@ def draw_maps(what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray,
     network = what in NETWORK
     stars = answer["tx_positions"] if network else np.array([source["receiver"]["position"]])
     values = _drawn(quantity, answer)[:6]
-    half = [(np.ptp(places) / (len(places) - 1) if len(places) > 1 else 1.0) / 2 for places in (xs, ys)]
-    extent = (xs[0] - half[0], xs[-1] + half[0], ys[0] - half[1], ys[-1] + half[1])
+    extent = _extent(xs, ys)
     wide = extent[1] - extent[0] > extent[3] - extent[2]
     rows, columns = (len(values), 1) if wide and len(values) < 4 else (-(-len(values) // 2), min(2, len(values)))
     ratio = (extent[3] - extent[2]) / (extent[1] - extent[0])
-    figure = Figure(figsize=(1.5 + 6 * columns, 0.8 + rows * (0.5 + 6 * min(ratio, 2.0))), layout="compressed")
+    lowest = 4.0  # inches, for the label of the colour bar
+    height = max(0.8 + rows * (0.5 + 6 * min(ratio, 2.0)), lowest)
+    figure = Figure(figsize=(1.5 + 6 * columns, height), layout="compressed")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     span = {"vmin": -180.0, "vmax": 180.0} if what == "best-beam" else _span(values)
     colors: Any = quantity.colors
@@ -518,6 +537,14 @@ def draw_maps(what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray,
     return figure
 
 
+def _extent(xs: Float[np.ndarray, " nx"], ys: Float[np.ndarray, " ny"]) -> tuple[float, float, float, float]:
+    """Returns the ends of a map whose squares have these centres; along an axis with one centre they are as wide as along the
+    other one."""
+    steps = [float(np.ptp(places)) / (len(places) - 1) if len(places) > 1 else 0.0 for places in (xs, ys)]
+    x, y = (0.5 * (step or max(steps) or 1.0) for step in steps)
+    return float(xs[0] - x), float(xs[-1] + x), float(ys[0] - y), float(ys[-1] + y)
+
+
 def draw_distribution(what: str, answer: dict[str, np.ndarray], source: Mapping[str, Any]) -> Figure:
     """Returns a figure of the cumulative distribution of a quantity over the positions of its maps at which antennas can be
     placed, one curve a frequency. Positions without any path count as lower than all others. `source` is the provenance
@@ -529,7 +556,8 @@ def draw_distribution(what: str, answer: dict[str, np.ndarray], source: Mapping[
         placed = np.sort(values[~answer["no_confidence"]])  # infinite ones behind all finite ones, NaN last
         known, lower = placed[np.isfinite(placed)], np.isnan(placed).sum()
         share = (lower + 1 + np.arange(len(known))) / max(len(placed), 1)
-        axis.step(known, share, where="post", label=f"{frequency / 1e9:g} GHz")
+        alone = "o" if len(known) == 1 else ""  # no line can be seen
+        axis.step(known, share, where="post", marker=alone, label=f"{frequency / 1e9:g} GHz")
     axis.set(xlabel=quantity.label, ylabel="share of the positions", ylim=(0, 1))
     axis.set_title(origin_words(source), fontsize=9)
     axis.grid(alpha=0.3)

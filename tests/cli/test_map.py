@@ -11,6 +11,7 @@ from builders.synthetic import tiny_dataset
 from builders.untrained import make_coherent_run, make_run
 from PIL import Image
 
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.applications.antenna_placement import power_at_users
 from wbgs_jax.commands import map as map_command
 from wbgs_jax.commands import predict as predict_command
@@ -136,6 +137,19 @@ def test_another_receiver_has_another_map(runs, tmp_path):
 
 
 NETWORK = ["--tx", "0.4,0.3,1.5", "-0.5,0.8,1.4", "--power-dbm", 20, 17, "--load", 0.5, "--bandwidth-mhz", 400]
+
+
+def test_a_warning_names_the_ends_of_a_map_of_several_transmitters(runs, tmp_path, monkeypatch):
+    """The places of the plane are the receivers."""
+
+    def stop(*_):
+        raise UserError("stopped")
+
+    monkeypatch.setattr(map_command, "at_transmitters", stop)
+    rest = ["--area", "-1,0:0,90", "--height", "1.3", "--step", 30, "--out", tmp_path / "map.npz"]
+    result = ask(runs, "wave", "--ghz", 28, "--what", "sinr", "--tx", "70,0,1", "0,0,1", *rest)
+    named = [line.split(" lies outside")[0] for line in result.err.splitlines() if "lies outside" in line]
+    assert sorted(set(named)) == ["warning: RX (-0.5, 75, 1.3) m", "warning: TX (70, 0, 1) m"]
 
 
 @pytest.mark.heavy

@@ -79,6 +79,9 @@ def test_an_answer_from_within_a_body_or_from_far_away_has_no_confidence():
     np.testing.assert_array_equal(domain.outside(places), [True, not within[1], False, True])
     (line,) = domain.warnings(receiver, centre[None], np.array([domain.band[0]]))
     assert "is inside a closed body (part 0 of" in line and "where no antenna can stand" in line
+    away = np.array([[500.0, 0, 1], [600, 0, 1]])
+    lines = domain.warnings(away, receiver[None], np.array([domain.band[0]]))
+    assert [line.split(" lies outside")[0] for line in lines] == ["RX (500, 0, 1) m", "RX (600, 0, 1) m"]
 
 
 def test_without_surfaces_places_nearby_keep_their_confidence():

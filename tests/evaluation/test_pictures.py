@@ -206,6 +206,33 @@ def test_a_curve_shows_values_and_intervals_and_a_single_point_is_none(rng):
         assert (axis.lines[0].get_linestyle(), axis.lines[0].get_marker()) == ("None", "o")
 
 
+def test_a_curve_over_frequencies_is_drawn_in_their_order():
+    queries = Queries(PLACES[:1], np.array([60e9, 2.4e9, 28e9]))
+    found = {"power_db": np.array([-70.0, -45, -60]), "within_db": np.array([3.0, 1, 2])}
+    axis = draw_prediction("power", found, queries, SOURCE, WALLS).axes[0]
+    np.testing.assert_allclose(axis.lines[0].get_xydata(), [[2.4, -45], [28, -60], [60, -70]])
+    assert axis.collections[0].get_paths()[0].vertices[:, 1].min() == -73  # of the third one
+    assert axis.get_xscale() == "log"
+    near = Queries(PLACES[:1], np.array([1e9, 1.2e9]))  # powers of ten would be no ticks for these
+    assert draw_prediction("k-factor", {"k_factor_db": np.ones(2)}, near, SOURCE, WALLS).axes[0].get_xscale() == "linear"
+
+
+def test_elements_and_queries_are_counted_in_whole_numbers():
+    one = Queries(PLACES[:1], HERTZ[:1], paired=True)
+    for what, found in {"mimo": {"mimo": np.ones((1, 16, 1), complex)}, "k-factor": {"k_factor_db": np.ones(1)}}.items():
+        axis = draw_prediction(what, found, one, SOURCE, WALLS).axes[0]
+        assert [tick for tick in axis.get_xticks() if 0 < tick < 2] == [1], what
+
+
+@pytest.mark.parametrize(("count", "beside"), [(5, False), (12, True)])
+def test_a_long_legend_stands_beside_the_curves(count, beside):
+    queries = Queries(np.arange(3.0 * count).reshape(count, 3), np.full(count, 28e9), paired=True)
+    figure = draw_prediction("snapshot", {"snapshots": np.ones((count, 4), complex)}, queries, SOURCE, WALLS)
+    figure.draw_without_rendering()
+    legend, axis = figure.axes[0].get_legend().get_window_extent(), figure.axes[0].get_window_extent()
+    assert (legend.x0 >= axis.x1) == beside and legend.x1 <= figure.bbox.x1
+
+
 def test_responses_are_in_decibels_of_the_first_element(rng):
     found = found_for("frequency-response", Queries(PLACES[:1], HERTZ[:1]), rng)
     above, below = draw_prediction("frequency-response", found, Queries(PLACES[:1], HERTZ[:1], True), SOURCE, WALLS).axes
@@ -251,6 +278,8 @@ def test_the_distribution_counts_links_without_paths_as_lower_and_single_paths_a
     (curve,) = axis.lines
     assert SOURCE["scene"] in axis.get_title()
     np.testing.assert_allclose(curve.get_xydata(), [[1, 0.5], [3, 0.75]])
+    single = {"k_factor_db": np.ones((1, 1, 1)), "no_confidence": np.zeros((1, 1), bool), "frequencies_hz": HERTZ[:1]}
+    assert draw_distribution("k-factor", single, SOURCE).axes[0].lines[0].get_marker() == "o"
 
 
 @pytest.mark.parametrize("dbm", [60.0, -20.0])
@@ -263,6 +292,16 @@ def test_what_is_received_does_not_depend_on_the_transmitted_power(dbm):
     np.testing.assert_array_equal(np.isnan(shown), [[True, False], [False, False]])
     (curve,) = draw_distribution("rsrp", answer | {"no_confidence": np.zeros((2, 2), bool)}, SOURCE).axes[0].lines
     np.testing.assert_allclose(curve.get_xydata()[:, 0], np.array([-240, -90, -80]) + dbm)
+
+
+@pytest.mark.parametrize(("count", "ends"), [(8, [0, 4, -0.15, 0.35]), (1, [-0.25, 0.75, -0.4, 0.6])])
+def test_a_map_of_a_single_row_is_as_high_as_its_squares(count, ends):
+    answer = {"k_factor_db": np.ones((1, 1, count)), "xs": 0.25 + 0.5 * np.arange(count), "ys": np.array([0.1])}
+    figure = draw_maps("k-factor", answer | {"height": 1.5, "frequencies_hz": HERTZ[:1]}, WALLS, SOURCE)
+    np.testing.assert_allclose(figure.axes[0].images[0].get_extent(), ends)
+    figure.draw_without_rendering()
+    label = figure.axes[0].images[0].colorbar.ax.yaxis.label.get_window_extent()
+    assert label.y0 >= 0 and label.y1 <= figure.bbox.y1
 
 
 @pytest.mark.parametrize(

@@ -102,8 +102,8 @@ def parse_numbers(word: str) -> Float[np.ndarray, " n"]:
 
 
 def point_words(position: Float[np.ndarray, "3"]) -> str:
-    """Returns "(x, y, z) m"."""
-    return "({:.6g}, {:.6g}, {:.6g}) m".format(*position)
+    """Returns "(x, y, z) m"; less than a nanometre, as between the ends of a line, is 0."""
+    return "({:.6g}, {:.6g}, {:.6g}) m".format(*(np.round(np.asarray(position, np.float64), 9) + 0.0))
 
 
 def link_words(tx_position: Float[np.ndarray, "3"], frequency_hz: float) -> str:

@@ -172,7 +172,8 @@ def make_maps(command: Command) -> None:
     plane = plane_of(command, field.dataset)
     rx = positions if len(positions) else np.asarray(field.receiver.position)[None]
     corners = np.array([[x, y, plane.height] for x in plane.xs[[0, -1]] for y in plane.ys[[0, -1]]])
-    warn(field.domain, rx[0], np.concatenate([corners, rx[1:]]), frequencies_hz)
+    receiving, sending = (corners, positions) if len(positions) else (rx, corners)
+    warn(field.domain, receiving, sending, frequencies_hz)
     with CountProgress(f"map of {command.what}", len(rx) * pieces(plane, frequencies_hz)) as progress:
         if len(positions):
             fields = at_transmitters(positions, field)

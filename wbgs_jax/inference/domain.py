@@ -86,12 +86,15 @@ class Domain(NamedTuple):
         return {name: masked(values) if name in INTERVALS else values for name, values in answer.items()}
 
     def warnings(
-        self, rx: Float[np.ndarray, "3"], tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, " freq"]
+        self,
+        rx: Float[np.ndarray, "*rx 3"],
+        tx_positions: Float[np.ndarray, "tx 3"],
+        frequencies_hz: Float[np.ndarray, " freq"],
     ) -> list[str]:
-        """Returns warnings about queries with unreliable predictions, one line each."""
+        """Returns warnings about queries of one or more receivers with unreliable predictions, one line each."""
         (low, high), band = self.box, self.band
         box = f"the box of {self.name}, {point_words(low)} to {point_words(high)}"
-        places = [("RX", rx), *(("TX", tx) for tx in tx_positions)]
+        places = [*(("RX", own) for own in rx.reshape(-1, 3)), *(("TX", tx) for tx in tx_positions)]
         lines = [
             f"{end} {point_words(place)} lies outside {box}; the field was not trained there"
             for end, place in places
