@@ -320,7 +320,8 @@ def draw_paths(
         "label": "transmitter",
     }
     for axis, place, hertz in zip(axes, positions, frequencies, strict=True):
-        own = np.flatnonzero(np.isclose(link, [*place, hertz / 1e9]).all(-1))
+        own = np.flatnonzero((link == [*place, hertz / 1e9]).all(-1))
+        own = own[found["tx"][own] == found["tx"][own[:1]]]  # a link may be queried twice
         top = found["power_db"][own].max(initial=NO_PATH_DB)
         power = found["power_db"][own] - top
         strong = np.argsort(power)[(np.sort(power) > -FADED_DB)]  # the strongest on top

@@ -149,7 +149,7 @@ def test_a_warning_names_the_ends_of_a_map_of_several_transmitters(runs, tmp_pat
     rest = ["--area", "-1,0:0,90", "--height", "1.3", "--step", 30, "--out", tmp_path / "map.npz"]
     result = ask(runs, "wave", "--ghz", 28, "--what", "sinr", "--tx", "70,0,1", "0,0,1", *rest)
     named = [line.split(" lies outside")[0] for line in result.err.splitlines() if "lies outside" in line]
-    assert sorted(set(named)) == ["warning: RX (-0.5, 75, 1.3) m", "warning: TX (70, 0, 1) m"]
+    assert sorted(set(named)) == ["warning: RX (-0.5, 15, 1.3) m", "warning: RX (-0.5, 75, 1.3) m", "warning: TX (70, 0, 1) m"]
 
 
 @pytest.mark.heavy

@@ -325,7 +325,7 @@ def test_a_stop_behind_the_last_step_says_how_to_go_on(run, scene, monkeypatch):
         patch.setattr(train_command, "learn_few", stopped)
         result = call(train_command.main, *arguments)
     assert "0 steps, " in result.err
-    assert result.code == 2 and result.err.endswith("\nerror: stopped; run the same command with --resume to continue\n")
+    assert result.code == 130 and result.err.endswith("\nstopped; run the same command with --resume to continue\n")
     with pytest.warns(UserWarning, match=r"the training of .*run is not finished \(step 4 is saved\)"):
         assert call(eval_command.main, "--run", run, "--no-pictures").code == 0
     assert not (run / "manifest.json").exists()

@@ -148,8 +148,8 @@ def found_for(what, queries, rng):
         positions, frequencies = queries.flat()
         link = {name: np.repeat(positions[:, k], 2) for k, name in enumerate("xyz")}
         points = np.repeat(np.stack([positions] + [np.broadcast_to(SOURCE["receiver"]["position"], (n, 3))] * 4, 1), 2, 0)
-        power = np.tile([-60.0, -110.0], n)
-        return link | {"frequency_ghz": np.repeat(frequencies / 1e9, 2), "power_db": power, "points_m": points}
+        power, tx = np.tile([-60.0, -110.0], n), np.repeat(np.arange(n), 2)
+        return link | {"tx": tx, "frequency_ghz": np.repeat(frequencies / 1e9, 2), "power_db": power, "points_m": points}
     if what == "frequency-response":
         response = rng.normal(size=(n, 8, 3)) + 1j
         impulses = np.fft.ifft(response, axis=1)
@@ -254,6 +254,12 @@ def test_paths_are_those_of_the_link_and_weak_ones_are_left_out(rng):
         np.testing.assert_allclose(one[[0, -1]], [place[:2], [0, 1]])
         assert "1 of 2 paths, the strongest -60.0 dB" in axis.get_title()
     assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ["receiver", "transmitter"]
+
+
+def test_links_close_together_and_links_queried_twice_have_paths_of_their_own(rng):
+    queries = Queries(PLACES[:1].repeat(3, 0), np.array([28e9, 28.0001e9, 28e9]), paired=True)
+    figure = draw_prediction("paths", found_for("paths", queries, rng), queries, SOURCE, WALLS)
+    assert ["1 of 2 paths" in axis.get_title() for axis in figure.axes[:3]] == [True] * 3
 
 
 def test_links_without_paths_and_paths_without_points(tmp_path, rng):

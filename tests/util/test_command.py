@@ -9,6 +9,7 @@ from builders.commands import assert_error_for_people, call
 
 from wbgs_jax._util.cli import option_value, parse_vector, point_words, run_command, say
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.training.progress import Interrupted
 from wbgs_jax.types import LARGEST_COORDINATE_M
 
 
@@ -17,6 +18,7 @@ from wbgs_jax.types import LARGEST_COORDINATE_M
     [
         (UserError("no such scene; give another"), 2, "error: no such scene; give another\n"),
         (KeyboardInterrupt(), 130, "interrupted\n"),
+        (Interrupted("stopped at step 4 of 9"), 130, "stopped at step 4 of 9\n"),
     ],
 )
 def test_what_stops_a_command_is_one_line_and_an_exit_code(capsys, error, code, line):

@@ -10,6 +10,8 @@ from jaxtyping import Float
 
 from wbgs_jax._util.errors import UserError
 
+STOPPED = 130
+"""Exit code of a command that was stopped by Ctrl-C."""
 _default_format = warnings.formatwarning
 
 
@@ -23,11 +25,11 @@ def run_command(main: Callable[[], None]) -> None:
     try:
         main()
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+        print(error if error.exit_code == STOPPED else f"error: {error}", file=sys.stderr)
+        raise SystemExit(error.exit_code) from None
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
-        raise SystemExit(130) from None
+        raise SystemExit(STOPPED) from None
     except BrokenPipeError:  # the reader, such as `| head`, has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(141) from None

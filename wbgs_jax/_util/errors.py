@@ -2,9 +2,12 @@
 
 
 class UserError(Exception):
-    """A problem that the user can fix. Command lines exit with code 2.
+    """A problem that the user can fix.
 
     The message states what is wrong, where, and what to do. It is always a single readable line, whatever it quotes."""
+
+    exit_code = 2
+    """Exit code of command lines; 130 means that the user stopped them, which is no error."""
 
     def __init__(self, message: str = ""):
         line = " ".join(message.splitlines())

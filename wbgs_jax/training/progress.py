@@ -24,6 +24,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from wbgs_jax._util.cli import STOPPED
 from wbgs_jax._util.compilation import has_compiled
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.progress_lines import Bar, Pulse
@@ -149,6 +150,8 @@ def _probe() -> float:
 
 class Interrupted(UserError):
     """Ctrl-C: the state is saved, and the message explains how to continue."""
+
+    exit_code = STOPPED
 
 
 @contextlib.contextmanager
