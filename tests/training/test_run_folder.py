@@ -171,7 +171,7 @@ def test_a_trained_field_is_the_one_that_was_saved(tmp_path):
         for x, y in zip(jax.tree.leaves(own), jax.tree.leaves(expected), strict=True):
             np.testing.assert_array_equal(x, y)
             assert x.dtype == y.dtype
-    with pytest.raises(UserError, match=r"box\.npz"):
+    with pytest.raises(UserError, match=r"the data of this training, .*box\.npz, are missing; put them back"):
         trained.dataset()
 
 

@@ -7,12 +7,13 @@ from typing import Any
 import jax
 import numpy as np
 
+from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.public_names import warn_renamed
 from wbgs_jax.config import Settings
 from wbgs_jax.data.conventions import ConventionName
 from wbgs_jax.data.dataset import Dataset, check_data
 from wbgs_jax.data.image_folder import records_frequency
-from wbgs_jax.data.load import load_dataset, source_names
+from wbgs_jax.data.load import load_dataset, source_names, source_paths
 from wbgs_jax.data.splits import (
     VALIDATION,
     fewer_transmitters,
@@ -98,7 +99,10 @@ class TrainedField:
     """Checksum of the training data; empty if it was not recorded."""
 
     def dataset(self) -> Dataset:
-        """Returns the training data; different data of the same name are a `UserError`."""
+        """Returns the training data; missing data, or different data of the same name, are a `UserError`."""
+        for path in source_paths(self.config.source):
+            if path.is_absolute() and not path.exists():
+                raise UserError(f"the data of this training, {path}, are missing; put them back there")
         return check_data(self.config.dataset(), self.data, f"this run ({self.config.source})")
 
     @property
