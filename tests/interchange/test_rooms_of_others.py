@@ -10,6 +10,7 @@ import pytest
 import trimesh
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.interchange.rooms import read_room
 from wbgs_jax.mesh.importers import read_objects
 
 CASES = Path(__file__).parents[3] / "shared" / "cases"
@@ -361,6 +362,51 @@ def test_map_coordinates_are_refused(tmp_path, away):
     (tmp_path / "a.obj").write_text(f"v {away} 0 0\nv {away + 6} 0 0\nv {away} 5 0\nf 1 2 3\n")
     with pytest.raises(UserError, match="single precision is too coarse for waves; subtract a point on the site"):
         read_objects(tmp_path / "a.obj")
+
+
+# Units and axes
+
+
+@pytest.mark.parametrize(
+    ("name", "comment", "scale"),
+    [
+        ("a.obj", "# Alias OBJ Model File\n# Exported from SketchUp, (c) 2000-2012\n# File units = inches\n\n", "0.0254"),
+        ("a.obj", "# This file uses centimeters as units for non-parametric coordinates.\n\n", "0.01"),
+        ("a.obj", "# Units: mm\n", "0.001"),
+        ("a.obj", "# File units = meters\n", ""),
+        ("a.obj", "# Exported unit by unit\n", ""),
+        ("a.ply", "comment units: cm\n", "0.01"),
+    ],
+)
+def test_a_unit_that_a_file_states_is_never_taken_for_the_metre(tmp_path, name, comment, scale):
+    ply = "ply\nformat ascii 1.0\n{}element vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\n"
+    ply += "property list uchar int vertex_indices\nend_header\n0 0 0\n6 0 0\n6 5 0\n3 0 1 2\n"
+    (tmp_path / name).write_text(ply.format(comment) if name.endswith("ply") else comment + FLOOR)
+    if scale:
+        with pytest.raises(UserError, match=f"{name} states that its unit is .*; read it with --scale {scale}, or"):
+            read_room(tmp_path / name, named=False)
+    (one,) = read_room(tmp_path / name, named=False, scale=1.0 if scale else None)
+    assert one.mesh.bounds[1, 0] == pytest.approx(6)
+
+
+def test_rooms_on_their_side_are_refused(tmp_path):
+    """A floor that spans the room reveals it; walls of a ground floor, lamps and mirrors do not."""
+    corners = np.array([[0, 0, 0], [6, 0, 0], [6, 5, 0], [0, 5, 0], [0, 0, 2.5], [6, 0, 2.5]])
+    text = "o {}\nf 1 2 3 4\no {}\nf 1 2 6 5\n"
+
+    def room(first, second, axes):
+        lines = "".join("v {:g} {:g} {:g}\n".format(*corner) for corner in corners[:, axes] * [1, 1, -1])
+        (tmp_path / "a.obj").write_text(lines + text.format(first, second))
+        return {one.name: one for one in read_room(tmp_path / "a.obj", named=False)}
+
+    for name in ("Floor01", "IfcSlab_3", "Boden", "floor.001"):
+        with pytest.raises(UserError, match=f"a.obj lies on its side: '{name}' is upright; give --up y, "):
+            room(name, "north", [0, 2, 1])
+        assert room(name, "north", [0, 1, 2])
+    for name in ("ground floor wall", "background", "plate"):
+        assert room(name, "north", [0, 2, 1])
+    (one,) = read_room(tmp_path / "a.obj", named=False, up="y")[:1]
+    assert one.mesh.extents[2] == pytest.approx(2.5)
 
 
 @pytest.mark.skipif(not CASES.exists(), reason="the small inputs are not beside the repository")

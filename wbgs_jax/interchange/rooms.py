@@ -1,5 +1,6 @@
 """Rooms from users' own files: objects with materials, with two-faced walls converted to single sheets."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from wbgs_jax.data.scene_file import Room, load_room
 from wbgs_jax.interchange.room_materials import Slab, slabs_of
 from wbgs_jax.mesh.bodies import share_in_box
 from wbgs_jax.mesh.importers import Y_UP, FileObject, read_objects
+from wbgs_jax.mesh.units import stated_unit
 from wbgs_jax.mesh.walls import divided, hidden_walls, walls_as_sheets
 
 MAX_TRIANGLES = 2_000_000
@@ -55,9 +57,14 @@ def read_room(
             towards the nearest of them is kept, without them the one towards the middle of the scene.
 
     Raises:
-        UserError: the file or the materials cannot be read, or the size is not that of a room.
+        UserError: the file or the materials cannot be read, the file states another unit than the metre, the room lies on its
+            side, or the size is not that of a room.
     """
     objects, simulated = read_objects(file, up, 1.0 if scale is None else scale), file.suffix.lower() == ".xml"
+    if scale is None:
+        _check_unit(file)
+    if up is None and not simulated:
+        _check_floors(file, objects)
     # Range of the largest side, metres: outside it the unit is probably not the metre. It is wider if the scale is given; a
     # scene.xml of Sionna RT is always in metres.
     _check_size(file, objects, (0.01, 20_000.0) if simulated or scale is not None else (0.5, 200.0))
@@ -149,6 +156,40 @@ def _row(one: RoomObject, sort: str) -> tuple[str, ...]:
 def _as_wall(one: RoomObject, mesh: trimesh.Trimesh, wall: float) -> RoomObject:
     slab = one.slab._replace(thickness=round(wall, 6)) if wall and not one.slab.given else one.slab
     return replace(one, mesh=mesh, slab=slab, wall=wall)
+
+
+def _check_unit(file: Path) -> None:
+    """Raises a `UserError` for a file whose comments state another unit than the metre."""
+    stated = stated_unit(file) if file.suffix.lower() in (".obj", ".ply") else None
+    if stated is not None and stated[1] != 1:
+        raise UserError(
+            f"{file} states that its unit is {stated[0]!r}; read it with --scale {stated[1]:g}, or with --scale 1 if its "
+            "numbers are metres"
+        )
+
+
+LEVEL = re.compile(r"(?<![a-z])(ifcslab|slab|floor|ground|ceiling|fu(ss|ß)boden|boden|decke|plafond)", re.IGNORECASE)
+UPRIGHT = re.compile(r"wall|wand|mur|facade|door|window|stair|column|mirror", re.IGNORECASE)
+"""Patterns of names of level surfaces, and of upright ones, whose names may contain those of storeys (`ground floor wall`)."""
+
+
+def _check_floors(file: Path, objects: Sequence[FileObject]) -> None:
+    """Raises a `UserError` for a room that is higher than deep, and whose largest floor or ceiling is an upright surface along
+    most of it: it lies on its side."""
+    bounds = np.array([one.mesh.bounds for one in objects])
+    size = bounds[:, 1].max(0) - bounds[:, 0].min(0)
+    named = [one for one in objects if LEVEL.search(one.name) and not UPRIGHT.search(one.name)]
+    if not named or size[1] >= size[2]:
+        return
+    floor = max(named, key=lambda one: float(one.mesh.area))
+    flat, along = 0.1, 0.5  # largest depth relative to the other sides, and smallest sides relative to the room
+    x, depth, z = floor.mesh.extents
+    if depth < flat * min(x, z) and x > along * size[0] and z > along * size[2]:
+        usual, other = ("y", "z") if file.suffix.lower() in (".glb", ".gltf") else ("z", "y")
+        raise UserError(
+            f"{file} lies on its side: {floor.name!r} is upright; give --up {other}, the axis of the file that points up, or "
+            f"--up {usual} if this is right"
+        )
 
 
 def _check_size(file: Path, objects: Sequence[FileObject], extent: tuple[float, float]) -> None:
