@@ -177,9 +177,17 @@ def msi(gain="17.85 dBi", tilt=6):
     return "\n".join(["NAME x", f"GAIN {gain}", "HORIZONTAL 360", *cuts[:360], "VERTICAL 360", *cuts[360:]])
 
 
-@pytest.mark.parametrize(("gain", "dbi"), [("17.85 dBi", 17.85), ("15.70 dBd", 17.85), ("15.7", 17.85)])
-def test_an_msi_file_adds_the_attenuations_of_its_cuts(tmp_path, gain, dbi):
-    (tmp_path / "a.msi").write_text(msi(gain))
+@pytest.mark.parametrize(
+    ("gain", "dbi"),
+    [
+        *[("17.85 dBi", 17.85), ("15.70 dBd", 17.85), ("15.7", 17.85)],
+        *[("15.7 dBd (17.85 dBi)", 17.85), ("17.85 (dBi) 15.7 (dBd)", 17.85), ("17.85dBi", 17.85), ("15,7 dBd", 17.85)],
+    ],
+)
+@pytest.mark.parametrize("end", ["\n", "\r\r\n"])
+def test_an_msi_file_adds_the_attenuations_of_its_cuts(tmp_path, gain, dbi, end):
+    text = msi(gain).replace("NAME x", "NAME München 6°").replace("GAIN", "GAIN:" if end == "\n" else "GAIN")
+    (tmp_path / "a.msi").write_bytes(text.replace("\n", end).encode("latin-1"))
     antenna = read_antenna(tmp_path / "a.msi")
     azimuth, elevation = np.radians([-20, 12.5, -20, -20]), np.radians([-6, -6, -11, -1])
     k = angles_to_direction(jnp.asarray(azimuth, jnp.float32), jnp.asarray(np.pi / 2 - elevation, jnp.float32))
@@ -191,7 +199,7 @@ def test_an_msi_file_adds_the_attenuations_of_its_cuts(tmp_path, gain, dbi):
 
 @pytest.mark.parametrize(
     ("line", "degrees"),
-    [("V", 0), ("vertical", 0), ("H", 90), ("HORIZONTAL", 90), ("+45", 45), ("-45", -45), ("DUAL SLANT 45", None)],
+    [("V", 0), ("vertical", 0), ("H", 90), ("HORIZONTAL", 90), ("+45", 45), ("45", 45), ("-45", -45), ("DUAL SLANT 45", None)],
 )
 def test_an_msi_file_has_the_polarisation_that_it_names(tmp_path, line, degrees, recwarn):
     (tmp_path / "a.msi").write_text(msi().replace("NAME x", f"NAME x\nPOLARIZATION {line}"))
@@ -213,6 +221,28 @@ def test_columns_that_describe_an_antenna_only_in_other_programs(tmp_path):
     numbered = [f"{number},{row},{28}" for number, row in enumerate(rows[1:])]
     (tmp_path / "a.csv").write_text("\n".join([f",{rows[0]},frequency_ghz", *numbered]))
     assert read_antenna(tmp_path / "a.csv")
+    numbered[-1] = numbered[-1][:-2] + "29"
+    (tmp_path / "a.csv").write_text("\n".join([f",{rows[0]},frequency_ghz", *numbered]))
+    with pytest.raises(UserError, match=r"a\.csv is for 29, other lines for 28; give one frequency per file"):
+        read_antenna(tmp_path / "a.csv")
+
+
+def test_gains_relative_to_the_largest_are_noted(tmp_path, recwarn):
+    """Of a beam, whose mean would be far below that of a passive antenna; an isotropic antenna has 0 dB everywhere."""
+    (tmp_path / "a.csv").write_text(table(lambda a, z: 0))
+    (tmp_path / "b.csv").write_text(table(lambda a, z: 8 - z / 10 - a / 20))
+    read_antenna(tmp_path / "a.csv"), read_antenna(tmp_path / "b.csv")
+    assert not recwarn
+    (tmp_path / "c.csv").write_text(table(lambda a, z: -z / 10 - a / 20))
+    with pytest.warns(UserWarning, match=r"c\.csv: the largest gain is 0 dB, and the mean .* add it to all of them"):
+        read_antenna(tmp_path / "c.csv")
+
+
+def test_fields_in_decibels_are_refused(tmp_path):
+    decibels = -20 * np.abs(np.cos(ZENITH))[:, None] * np.ones(len(AZIMUTH))
+    np.savez(tmp_path / "a.npz", e_theta=decibels, e_phi=decibels - 40, zenith=ZENITH, azimuth=AZIMUTH)
+    with pytest.raises(UserError, match=r"e_theta of .*a\.npz is real; give the complex field, neither"):
+        read_antenna(tmp_path / "a.npz")
 
 
 def table(gain, azimuths=range(0, 360, 30)):

@@ -105,8 +105,12 @@ def _remove_left(path: Path) -> None:
                     left.unlink()
 
 
-def read_text(path: Path) -> str:
+def read_text(path: Path, other: str = "") -> str:
     """Returns the content of a text file.
+
+    Args:
+        path: of the file.
+        other: encoding of files that are neither UTF-8 nor UTF-16; without it they are an error.
 
     Raises:
         UserError: anything else, including pipes, from which a read might never return.
@@ -120,6 +124,8 @@ def read_text(path: Path) -> str:
     except UnicodeDecodeError as error:
         if error.object[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
             raise UserError(f"{path} is in UTF-16; save it as text in UTF-8") from error
+        if other:
+            return path.read_bytes().decode(other)
         raise UserError(f"{path} is not a text file ({error.reason}); copy it again") from error
 
 

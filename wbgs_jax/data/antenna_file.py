@@ -9,6 +9,7 @@ antenna.
 import dataclasses
 import re
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -68,6 +69,7 @@ def _read_csv(path: Path) -> Antenna:
             f"{', '.join(components)} instead of the gain"
         )
     optional = tuple(name for name in phase if name in names)
+    rows = _of_one_frequency(path, names, rows)
     columns = [names.index(name) for name in (*needed, *optional)]
     table = []
     most_rows = 1_000_000  # largest number of directions: finer than half a degree
@@ -90,6 +92,18 @@ def _read_csv(path: Path) -> Antenna:
     return _antenna(path, fields[..., 0], fields[..., 1])
 
 
+def _of_one_frequency(path: Path, names: list[str], rows: Iterator[tuple[int, list[str]]]) -> Iterator[tuple[int, list[str]]]:
+    """Yields the rows of a table, all of which must be for one frequency."""
+    columns = [number for number, name in enumerate(names) if name.startswith("frequency")]
+    first: list[str] | None = None
+    for line, row in rows:
+        own = [row[number] for number in columns]
+        first = own if first is None else first
+        if own != first:
+            raise UserError(f"line {line} of {path} is for {own[0]}, other lines for {first[0]}; give one frequency per file")
+        yield line, row
+
+
 def _read_archive(path: Path) -> Antenna:
     arrays = read_arrays(path, "an antenna pattern", "export it again", ("e_theta", "e_phi", "zenith", "azimuth"))
     if missing := [name for name in ("e_theta", "e_phi", "zenith", "azimuth") if name not in arrays]:
@@ -101,17 +115,18 @@ def _read_archive(path: Path) -> Antenna:
     for name in ("e_theta", "e_phi"):
         if arrays[name].shape != shape or arrays[name].dtype.kind not in "fc":
             raise UserError(f"{name} of {path} has shape {arrays[name].shape}; give numbers of shape {shape}, like the angles")
+        if arrays[name].dtype.kind == "f":
+            raise UserError(f"{name} of {path} is real; give the complex field, neither its magnitude nor decibels")
         fields.append(np.asarray(arrays[name], np.complex128).reshape(-1))
     found = on_grid(path, zenith, azimuth, np.stack(fields, -1))
     return _antenna(path, found[..., 0], found[..., 1])
 
 
 def _read_msi(path: Path) -> Antenna:
-    lines = [line.split() for line in read_text(path).splitlines()]
-    head = {words[0].upper(): words[1:] for words in lines if words and re.match("[A-Za-z]", words[0])}
-    dipole_dbi = 2.15  # gain of a half-wave dipole, the reference of dBd
+    lines = [words for line in read_text(path, "latin-1").splitlines() if (words := line.split())]
+    head = {words[0].upper().rstrip(":="): words[1:] for words in lines if re.match("[A-Za-z]", words[0])}
     try:
-        gain = float(head["GAIN"][0]) + (0.0 if "DBI" in "".join(head["GAIN"][1:]).upper() else dipole_dbi)
+        gain = _gain_dbi(" ".join(head["GAIN"]))
         horizontal, vertical = (_cut(lines, name) for name in ("HORIZONTAL", "VERTICAL"))
     except (KeyError, IndexError, ValueError):
         raise UserError(
@@ -126,7 +141,7 @@ def _read_msi(path: Path) -> Antenna:
     attenuation = vertical[(zenith[:, None] - 90) % CUT] + horizontal[-azimuth % CUT]
     antenna = tabulated(10 ** ((gain - attenuation) / 20), None)
     polarisation = " ".join(head.get("POLARIZATION", ["V"])).upper()
-    slants = {"V": 0, "VERTICAL": 0, "H": 90, "HORIZONTAL": 90, "+45": 45, "-45": -45}  # degrees
+    slants = {"V": 0, "VERTICAL": 0, "H": 90, "HORIZONTAL": 90, "+45": 45, "45": 45, "-45": -45}  # degrees
     if polarisation not in slants:
         warnings.warn(
             f"{path}: the polarisation {polarisation!r} is taken to be vertical; write that of one port: V, H, +45 or -45",
@@ -136,14 +151,24 @@ def _read_msi(path: Path) -> Antenna:
     return dataclasses.replace(antenna, slant=jnp.asarray(slant)) if slant else antenna
 
 
+def _gain_dbi(text: str) -> float:
+    """Returns the first gain in a text (dBi), which may have a decimal comma; it is in dBd unless dBi follows the number."""
+    dipole_dbi = 2.15  # gain of a half-wave dipole, the reference of dBd
+    found = re.match(r"([-+]?\d+(?:[.,]\d+)?)[\s([]*(dBi)?", text, re.IGNORECASE)
+    if found is None:
+        raise ValueError("a gain that is not a number")
+    return float(found[1].replace(",", ".")) + (0.0 if found[2] else dipole_dbi)
+
+
 def _cut(lines: list[list[str]], name: str) -> Float[np.ndarray, "360"]:
     """Returns the attenuations (dB) of a cut, by degree; raises a `ValueError` unless there is one for every degree."""
     start = next(i for i, words in enumerate([*lines, [name, ""]]) if words and words[0].upper() == name) + 1
     found = np.full(CUT, np.nan)
     for angle, value, *_ in lines[start : start + CUT]:
-        if float(angle) % 1:
+        degrees, attenuation = (float(word.replace(",", ".")) for word in (angle, value))
+        if degrees % 1:
             raise ValueError("an angle between two degrees")
-        found[int(float(angle)) % CUT] = float(value)
+        found[int(degrees) % CUT] = attenuation
     if not np.isfinite(found).all():
         raise ValueError("an angle without a value")
     return found
@@ -197,6 +222,13 @@ def _antenna(
         raise UserError(
             f"{path} has gains of {10 * np.log10(mean):.3g} dB on average over the sphere, more than a passive antenna; give "
             "decibels relative to an isotropic antenna, not powers or attenuations"
+        )
+    largest, lost = float(power.max()), 0.5  # power gains: of the strongest direction, and mean of an antenna of 50 % losses
+    if phi is None and mean < lost and abs(10 * np.log10(max(largest, 1e-30))) < 0.05:
+        warnings.warn(
+            f"{path}: the largest gain is 0 dB, and the mean over the sphere {10 * np.log10(mean):.3g} dB; if gains are relative "
+            "to the largest one, add it to all of them",
+            stacklevel=2,
         )
     if phi is not None:
         if not mean > 0:
