@@ -226,8 +226,8 @@ def _antenna(
     largest, lost = float(power.max()), 0.5  # power gains: of the strongest direction, and mean of an antenna of 50 % losses
     if phi is None and mean < lost and abs(10 * np.log10(max(largest, 1e-30))) < 0.05:
         warnings.warn(
-            f"{path}: the largest gain is 0 dB, and the mean over the sphere {10 * np.log10(mean):.3g} dB; if gains are relative "
-            "to the largest one, add it to all of them",
+            f"{path}: the largest gain is 0 dB, and the mean over the sphere {10 * np.log10(mean):.3g} dB; if gains are "
+            "relative to the largest one, add it to all of them",
             stacklevel=2,
         )
     if phi is not None:
