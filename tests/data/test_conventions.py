@@ -108,11 +108,13 @@ def test_a_folder_is_read_as_it_reveals_or_as_it_is_named(tmp_path, rng):
     assert np.ptp(np.asarray(found.receivers.element_positions[0, :, 2])) == 0  # the array lies flat
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        known = load_layout(folder, 1e9, convention="zenith")
-        np.testing.assert_array_equal(known.observations["pas"], images)
         (folder / "gateway_info.yml").write_text("convention: elevation\n" + (folder / "gateway_info.yml").read_text())
         found = [load_layout(folder, 1e9, convention=name) for name in (None, "elevation")]
         assert [one.convention for one in found] == ["elevation"] * 2
+    (folder / "gateway_info.yml").write_text((folder / "gateway_info.yml").read_text().replace(": elevation", ": zenith"))
+    with pytest.warns(UserWarning, match="the convention zenith is given, but the last row shows a single direction"):
+        np.testing.assert_array_equal(load_layout(folder, 1e9).observations["pas"], images)
+    (folder / "gateway_info.yml").write_text((folder / "gateway_info.yml").read_text().replace(": zenith", ": elevation"))
     with pytest.raises(UserError, match="specifies the convention elevation; leave out zenith"):
         load_layout(folder, convention="zenith")
     (folder / "gateway_info.yml").write_text((folder / "gateway_info.yml").read_text().replace(": elevation", ": north"))
@@ -131,6 +133,25 @@ def test_a_quaternion_in_another_order_is_noted(tmp_path, rng, convention):
             warnings.simplefilter("always")
             load_layout(folder, 1e9, convention=convention)
         assert ["clearly better if the orientation is w, x, y, z" in str(note.message) for note in notes] == [True] * noted
+
+
+@pytest.mark.parametrize("convention", ["zenith", "elevation"])
+def test_spectra_of_other_transmitters_are_noted(tmp_path, rng, convention):
+    """Rows in another order, images whose strong directions are dark or mirrored; never right ones."""
+    images, receiver, tx, _ = room(rng, 60, convention)
+    cases = {
+        "right": (images, tx),
+        "shuffled": (images, tx[rng.permutation(60)]),
+        "inverted": (255 - images, tx),
+        "few": (images[:12], tx[:12][::-1]),
+    }
+    for name, (shown, places) in cases.items():
+        folder = folder_of(shown, receiver, places, tmp_path / name)
+        with warnings.catch_warnings(record=True) as notes:
+            warnings.simplefilter("always")
+            load_layout(folder, 1e9, convention=convention)
+        noted = ["no brighter towards their own transmitters" in str(note.message) for note in notes]
+        assert noted == [True] * (name in ("shuffled", "inverted")), name
 
 
 def test_what_the_test_shows_does_not_decide(tmp_path, rng):

@@ -452,3 +452,18 @@ def test_the_published_rfid_sample_loads(shared_data):
     assert (len(dataset), len(dataset.train), len(dataset.test)) == (40, 32, 8)
     assert set(dataset.frequencies_hz) == {915e6}
     assert len(dataset.vertices) == 0
+
+
+def test_files_in_other_spellings(folder, recwarn):
+    """Endings in capitals, quotation marks, and models that are not read."""
+    before = load_layout(folder)
+    image = folder / "spectrum" / "00003.png"
+    image.rename(image.with_suffix(".PNG"))
+    rows = (folder / "tx_pos.csv").read_text().splitlines()
+    (folder / "tx_pos.csv").write_text('"x","y","z"\n' + "\n".join(rows[1:]))
+    (folder / "room.glb").write_bytes(b"glTF")
+    np.testing.assert_array_equal(load_layout(folder).observations["pas"], before.observations["pas"])
+    assert not any("is not read" in str(note.message) for note in recwarn)
+    (folder / "point_cloud.ply").unlink()
+    with pytest.warns(UserWarning, match=r"room\.glb is not read; convert it .*: wbgs-jax convert room\.glb --out room\.npz"):
+        load_layout(folder)

@@ -112,9 +112,50 @@ def turned(
         rank = _brighter(images, *_pixel(local, convention))
         return by_transmitter(np.where(local[:, 2] > 0, rank, 0.5), tx_index)  # nothing is known below the horizon
 
-    gain = brightness(jnp.roll(receiver.orientation, -1)) - brightness(receiver.orientation)
-    fewest, clear = 10, 0.1  # transmitters, and mean gain in the share of pixels that are less bright
-    return len(gain) >= fewest and float(gain.mean()) > clear and _significant(gain)
+    other = brightness(jnp.roll(receiver.orientation, -1))
+    gain = other - brightness(receiver.orientation)
+    # Transmitters, mean gain in the share of pixels that are less bright, and mean share for a frame that is right.
+    fewest, clear, bright = 10, 0.1, 0.75
+    return len(gain) >= fewest and float(gain.mean()) > clear and float(other.mean()) > bright and _significant(gain)
+
+
+def unrelated(
+    images: UInt8[np.ndarray, "n 90 360"],
+    receiver: Receiver,
+    tx_positions: Float[np.ndarray, "n 3"],
+    tx_index: Int[np.ndarray, " n"],
+    convention: ConventionName,
+) -> bool:
+    """Returns whether spectra are no brighter towards their own transmitters than towards those of other spectra, if there are
+    enough transmitters in different directions.
+
+    Args:
+        images: as stored in the folder.
+        receiver: of the spectra.
+        tx_positions: world frame, metres.
+        tx_index: index of the transmitter.
+        convention: of the images.
+    """
+    fewest, most, draws, better = 24, 200, 20, 0.9  # transmitters, random orders of them, and share of these that is exceeded
+    towards = jnp.asarray(tx_positions - np.asarray(receiver.position, np.float64))
+    local = np.asarray(to_local(towards, receiver.orientation))
+    chosen = np.unique(tx_index, return_index=True)[1]
+    chosen = chosen[local[chosen, 2] > 0]
+    directions = local[chosen] / np.linalg.norm(local[chosen], axis=1, keepdims=True)
+    alike = 0.9  # length of the mean direction of transmitters above which those of others do not differ enough
+    if len(chosen) < fewest or np.linalg.norm(directions.mean(0)) > alike:
+        return False
+    chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), most)).astype(int)]
+    rng = np.random.default_rng(0)
+    orders = [chosen, *(rng.permutation(chosen) for _ in range(draws))]
+    own, *others = (_brighter(images[chosen], *_pixel(local[order], convention)).mean() for order in orders)
+    return bool(own <= np.quantile(others, better))
+
+
+def contradiction(images: UInt8[np.ndarray, "n 90 360"], convention: ConventionName) -> str:
+    """Returns why spectra show another convention than the named one; empty if they do not."""
+    found = _by_the_zenith(images)
+    return "" if found is None or found.convention == convention else found.reason
 
 
 def _significant(gain: Float[np.ndarray, " t"]) -> bool:

@@ -34,7 +34,17 @@ from PIL import Image
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_text, read_yaml, safe_name
-from wbgs_jax.data.conventions import CONVENTIONS, ConventionName, Evidence, array_of, find_convention, to_pas, turned
+from wbgs_jax.data.conventions import (
+    CONVENTIONS,
+    ConventionName,
+    Evidence,
+    array_of,
+    contradiction,
+    find_convention,
+    to_pas,
+    turned,
+    unrelated,
+)
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import check_surroundings, materials_of, scene_dataset
 from wbgs_jax.data.scene_file import Room, SceneFile, check_mesh, load_room
@@ -183,10 +193,21 @@ def load_layout(
     trained = np.sort(np.concatenate([split["train"], split["validation"]]))
     shown = images[trained], make_receiver(gateway.position, gateway.orientation), positions[trained], tx_index[trained]
     named = _agreed(convention, gateway.convention, folder) or _inferred(folder, find_convention(*shown))
-    if turned(*shown, named):
+    if reason := contradiction(shown[0], named):
+        warnings.warn(
+            f"{folder}: the convention {named} is given, but {reason}; check it, and whether images are upside down",
+            stacklevel=2,
+        )
+    elif turned(*shown, named):
         warnings.warn(
             f"{folder / GATEWAY}: lines of sight fit the spectra clearly better if the orientation is w, x, y, z; write it as "
             "x, y, z, w, [0, 0, 0, 1] for no rotation",
+            stacklevel=2,
+        )
+    elif unrelated(*shown, named):
+        warnings.warn(
+            f"{folder}: spectra are no brighter towards their own transmitters than towards others; row k of {POSITIONS} must "
+            f"belong to image k, bright pixels be strong directions, and {GATEWAY} have the receiver's orientation",
             stacklevel=2,
         )
     receiver = make_receiver(gateway.position, gateway.orientation, array_of(named))
@@ -269,9 +290,22 @@ def _read_room(folder: Path) -> Room:
         if mesh.exists():
             raise UserError(f"{folder} has both {MESH} and {ROOM}; keep only one of them")
         return load_room(room)
+    _note_unread(folder)
     vertices, faces = read_ply(mesh) if mesh.exists() else (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     arrays = {"vertices": mesh_to_world(vertices), "faces": faces, "face_part": np.zeros(len(faces), np.int32)}
     return Room(**check_mesh(arrays, str(mesh)))
+
+
+def _note_unread(folder: Path) -> None:
+    """Warns of models of the room in other formats, unless the folder has a mesh that is read."""
+    models = (".glb", ".gltf", ".obj", ".ply", ".xml", ".stl", ".pcd", ".dae", ".fbx")
+    unread = [path.name for path in sorted(folder.iterdir()) if path.suffix.lower() in models and path.name != MESH]
+    if unread and not (folder / MESH).exists():
+        warnings.warn(
+            f"{folder}: {unread[0]} is not read; if it is a model of the room, convert it: wbgs-jax convert {unread[0]} "
+            f"--out {ROOM}",
+            stacklevel=4,
+        )
 
 
 def _check_axes(path: Path, vertices: Float[np.ndarray, "v 3"], antennas: Float[np.ndarray, "n 3"]) -> None:
@@ -285,7 +319,8 @@ def _check_axes(path: Path, vertices: Float[np.ndarray, "v 3"], antennas: Float[
 
 
 def _read_images(folder: Path) -> UInt8[np.ndarray, "n 90 360"]:
-    numbered = sorted((_image_number(path.stem, folder), path) for path in folder.glob("*.png"))
+    files = [path for path in folder.glob("*") if path.suffix.lower() == ".png"]
+    numbered = sorted((_image_number(path.stem, folder), path) for path in files)
     if not numbered:
         raise UserError(f"{folder} has no .png spectra; add 00001.png, 00002.png, ...")
     for expected, (number, path) in enumerate(numbered, 1):
@@ -309,7 +344,8 @@ def _read_image(path: Path) -> UInt8[np.ndarray, "90 360"]:
 
 
 def _read_positions(path: Path, n: int) -> Float[np.ndarray, "n 3"]:
-    header, *rows = [line for line in read_text(path).splitlines() if line.strip()] or [""]
+    text = read_text(path).replace('"', "")  # some programs write the names of columns, or all cells, between quotation marks
+    header, *rows = [line for line in text.splitlines() if line.strip()] or [""]
     if header.lower().replace(" ", "") != "x,y,z":
         raise UserError(f"{path} starts with {header[:40]!r}; its first line must be x,y,z")
     if len(rows) != n:
