@@ -118,6 +118,48 @@ def test_positions_in_larger_units_are_refused_without_vertices(rng):
     check_paths(replace(unknown, targets=paths.sources[np.zeros(len(paths.targets), int)], tau=paths.tau + 1e-8), "radar")
 
 
+def sight_lines(rng, frequency=5e9):
+    """Arrays of lines of sight between isotropic antennas."""
+    receiver, places = np.array([[0.0, 0.0, 1.0]]), rng.uniform([1, -2, 0.5], [4, 2, 2.5], (8, 3))
+    offset = receiver - places
+    distance = np.linalg.norm(offset, axis=1)
+    angles = {
+        name: value[None, :, None]
+        for end, way in (("t", offset), ("r", -offset))
+        for name, value in (
+            (f"theta_{end}", np.arccos(way[:, 2] / distance)), (f"phi_{end}", np.arctan2(way[:, 1], way[:, 0]))
+        )
+    }  # fmt: skip
+    a = (SPEED_OF_LIGHT / frequency / (4 * np.pi * distance)).astype(complex)[None, None, :, None, None]
+    return angles | {"a": a, "tau": (distance / SPEED_OF_LIGHT)[None, :, None], "sources": places, "targets": receiver}
+
+
+def test_gains_of_lines_of_sight_that_cannot_be_are_noted(rng, recwarn):
+    """At another frequency, with a transmitted power, as powers or half the decibels; antennas have patterns and losses."""
+    arrays = sight_lines(rng)
+    a = arrays["a"]
+    for usual in (a, 3 * a * rng.uniform(0.2, 1, a.shape), 1e-3 * a / np.abs(a).max()):
+        check_paths(from_sionna(arrays | {"a": usual}, 5e9), "hall")
+    assert not recwarn
+    cases = (
+        (a, 28e9, "15 dB stronger"),
+        (10 * a, 5e9, "20 dB stronger"),
+        (a**2, 5e9, "dB weaker"),
+        (a**0.5, 5e9, "dB stronger"),
+    )
+    for values, frequency, words in cases:
+        with pytest.warns(UserWarning, match=f"hall: lines of sight are .*{words} than .* {frequency / 1e9:g} GHz; check the"):
+            check_paths(from_sionna(arrays | {"a": values}, frequency), "hall")
+
+
+def test_coefficients_saved_as_one_array_of_both_parts(rng, tmp_path):
+    """As np.savez(a=paths.a) writes the pair of Sionna RT."""
+    arrays = sight_lines(rng)
+    a = arrays["a"] * np.exp(0.4j)
+    np.savez(tmp_path / "paths.npz", **(arrays | {"a": np.stack([a.real, a.imag])}))
+    np.testing.assert_allclose(load_paths(tmp_path / "paths.npz", 5e9).a, a[:, 0, :, 0])
+
+
 @pytest.mark.parametrize("end", ["r", "t"])
 def test_directions_without_lines_of_sight_are_compared_with_vertices(rng, end):
     paths = bounced_paths(rng, direct=False)

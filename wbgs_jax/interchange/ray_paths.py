@@ -9,6 +9,7 @@ Paths must be physically plausible: delays that fit the positions, angles in rad
 they are probably in another unit, and the error names the array.
 """
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -249,11 +250,13 @@ def read_paths(path: Path | str) -> dict[str, np.ndarray]:
 
 
 def array_of(paths: Any, name: str) -> np.ndarray | None:
-    """Returns an array by key or attribute; a pair of arrays for `a`, as Sionna has it, becomes a complex one."""
+    """Returns an array by key or attribute; a pair of arrays for `a`, as Sionna has it, becomes a complex one, also if it
+    was saved as one real array."""
     value = paths.get(name) if isinstance(paths, Mapping) else getattr(paths, name, None)
     if value is None:
         return None
-    if name == "a" and isinstance(value, tuple | list) and len(value) == 2:
+    stacked = isinstance(value, np.ndarray) and value.dtype.kind == "f" and value.ndim == 1 + ARRAYS
+    if name == "a" and (isinstance(value, tuple | list) or stacked) and len(value) == 2:
         real, imaginary = map(np.asarray, value)
         return _complex(real, imaginary, "a of these paths")
     return np.asarray(value)
@@ -445,6 +448,7 @@ def _check_line_of_sight(
     # The phases of antennas on opposite sides of a centre cancel in the product of their coefficients, as do the signs of
     # polarised ones.
     direct = sight & ~(paths.interactions != NONE).any(0)
+    _note_gains(paths, name, direct)
     product, turn = (paths.a * opposite)[direct], carrier(2 * paths.frequency_hz, paths.tau[direct])
     product, turn = product[product != 0], turn[product != 0]
     alike, different, fewest = 0.9, 0.7, 5  # lengths of mean phasors that agree and that differ, and number of lines of sight
@@ -455,6 +459,28 @@ def _check_line_of_sight(
         raise UserError(
             f"{name}: a contains the phase of the carrier, as that of Sionna's paths.cir() does: lines of sight turn with "
             "their delays; give paths.a"
+        )
+
+
+def _note_gains(paths: RayPaths, name: str, direct: Bool[np.ndarray, "r t k"]) -> None:
+    """Warns of lines of sight whose gains are implausible between antennas in free space: far off, or off by one factor, as at
+    another frequency."""
+    amplitude, length = np.abs(paths.a[direct]), SPEED_OF_LIGHT * paths.tau[direct]
+    received = (amplitude > 0) & (length > 0)
+    # Lines of sight, usual range of their gains, and least gain and largest deviations of those that are off by one factor.
+    fewest, usual_db, factor_db, alike_db = 5, (-40.0, 25.0), 3.0, 0.5
+    if received.sum() < fewest:
+        return
+    free_space = SPEED_OF_LIGHT / (4 * np.pi * paths.frequency_hz * length[received])
+    gains = 20 * np.log10(amplitude[received] / free_space)
+    middle = float(np.median(gains))
+    alike = np.abs(gains - middle).max() < alike_db
+    if not usual_db[0] < middle < usual_db[1] or (alike and abs(middle) > factor_db):
+        warnings.warn(
+            f"{name}: lines of sight are {abs(middle):.3g} dB {'stronger' if middle > 0 else 'weaker'} than between isotropic "
+            f"antennas at {paths.frequency_hz / 1e9:g} GHz; check the frequency, and give gains relative to the transmitted "
+            "power, as amplitudes",
+            stacklevel=4,
         )
 
 

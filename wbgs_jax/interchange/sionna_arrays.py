@@ -116,7 +116,10 @@ def scene_of_sionna(
     what = source or name
     arrays = {key: found for key in OF_PATHS if (found := array_of(paths, key)) is not None}
     if "a" in arrays and arrays["a"].ndim > ARRAYS:
-        raise UserError(f"a of {what} has {arrays['a'].ndim} axes, including time, as that of paths.cir(); give `paths.a`")
+        raise UserError(
+            f"a of {what} has {arrays['a'].ndim} axes, including time, as that of paths.cir() and of Sionna before 1.0; "
+            "give `paths.a` of Sionna RT 1.0 or later"
+        )
     check_arrays(arrays, f"the paths of {what}")
     for end in ("sources", "targets"):
         if (found := array_of(paths, end)) is not None:
