@@ -140,6 +140,20 @@ def test_the_terms_of_data_are_found(tmp_path):
             "tabs between its cells; separate them by commas",
         ),
         ("readings.csv", "x,y,rssi,rssi,rssi\n1,1,-50,-60,-70\n", "has two columns of the same name"),
+        ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3,\n1,1,-50,-60,-70,\n", "a column without a name, number 6; name it, or"),
+        ("readings.csv", "sep=,\nx,y,rssi_1,rssi_2,rssi_3\n1,1,-50,-60,-70\n", "its first line must name .* without '#' or"),
+        ("readings.csv", "# x,y,rssi_1,rssi_2,rssi_3\n1,1,-50,-60,-70\n", "its first line must name .* without '#' or"),
+        ("readings.csv", 'x,y,rssi_1,rssi_2,rssi_3\n"1,5",1,-50,-60,-70\n', "'1,5' is not a number; write decimal points"),
+        (
+            "readings.csv",
+            "x [cm],y [cm],rssi_1,rssi_2,rssi_3\n1,1,-50,-60,-70\n",
+            r"column 'x \[cm\]'; convert it to metres, and",
+        ),
+        (
+            "readings.csv",
+            "x,y,z,rssi_1,rssi_2,rssi_3\n1,1,1300,-50,-60,-70\n",
+            r"1.3e\+03 m apart in height, but at most .* in plan",
+        ),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path, rng, file, content, says):
@@ -150,6 +164,20 @@ def test_what_is_wrong_is_said(tmp_path, rng, file, content, says):
         (tmp_path / file).write_text(content)
     with pytest.raises(UserError, match=says):
         load_readings(tmp_path, HEIGHT)
+
+
+def test_the_metre_may_stand_behind_coordinates(tmp_path, rng):
+    """As surveys name their columns, in every usual spelling."""
+    folder(tmp_path, rng, n=20)
+    plain = load_readings(tmp_path, HEIGHT)
+    for name in ("readings.csv", "receivers.csv"):
+        head, rows = (tmp_path / name).read_text().split("\n", 1)
+        spelled = {"x": "X [m]", "y": "y (metres)", "z": "z_m", **{f"rssi_{k}": f"RSSI {k} (dBm)" for k in (1, 2, 3)}}
+        (tmp_path / name).write_text(",".join(spelled.get(word, word) for word in head.split(",")) + "\n" + rows)
+    found = load_readings(tmp_path, HEIGHT)
+    np.testing.assert_array_equal(found.places, plain.places)
+    np.testing.assert_array_equal(found.powers, plain.powers)
+    np.testing.assert_array_equal(found.receivers, plain.receivers)
 
 
 def test_tables_in_utf_16_are_refused(tmp_path, rng):

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 
 from wbgs_jax._util.cli import parse_number
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.mesh.units import METRES
 
 Tokens = tuple[str, ...]
 
@@ -119,16 +120,31 @@ def read_table(path: Path) -> tuple[list[str], list[list[str]]]:
     lines = [(number, row) for number, row in read_lines(path) if any(row)]
     if len(lines) < 2:
         raise UserError(f"{path} has no rows after its header")
-    header = [name.lower() for name in lines[0][1]]
+    if lines[0][1][0].lower().startswith(("#", "sep=")):
+        begin = ",".join(lines[0][1])[:40]
+        raise UserError(f"{path} begins with {begin!r}; its first line must name the columns, without '#' or 'sep='")
+    header = [_plain(path, name) for name in lines[0][1]]
     for sign, name in ((";", "';'"), ("\t", "tabs")):
         if len(header) == 1 and sign in header[0]:
             raise UserError(f"{path} has {name} between its cells; separate them by commas")
     if len(set(header)) < len(header):
         raise UserError(f"{path} has two columns of the same name: {', '.join(header)}")
+    if "" in header[1:]:  # the first one may hold numbers of rows
+        raise UserError(f"{path} has a column without a name, number {1 + header.index('', 1)}; name it, or remove it")
     for number, row in lines[1:]:
         if len(row) != len(header):
             raise UserError(f"{path}, line {number} has {len(row)} cells, but the header has {len(header)}")
     return header, [row for _, row in lines[1:]]
+
+
+def _plain(path: Path, name: str) -> str:
+    """Returns the name of a column in lower case; that of a coordinate without its unit, which must be the metre."""
+    found = re.fullmatch(r"([xyz][12]?)\s*[\[(/_ ]\s*([a-z]+)\s*[\])]?", name.lower())
+    if found is None or found[2] not in METRES:
+        return name.lower()
+    if METRES[found[2]] != 1:
+        raise UserError(f"{path} has the column {name!r}; convert it to metres, and name it {found[1]!r}")
+    return found[1]
 
 
 def numbers(path: Path, header: list[str], rows: list[list[str]], columns: list[str]) -> Float[np.ndarray, "n k"]:
@@ -145,7 +161,8 @@ def numbers(path: Path, header: list[str], rows: list[list[str]], columns: list[
             try:
                 values[i, k] = parse_number(row[column]) if row[column] else np.nan
             except ValueError:
-                hint = "leave cells empty where nothing was received"
+                comma = "," in row[column]
+                hint = "write decimal points" if comma else "leave cells empty where nothing was received"
                 raise UserError(f"{path}, row {i + 1}: {row[column]!r} is not a number; {hint}") from None
     return values
 
@@ -222,8 +239,12 @@ def check_powers(where: Path, powers: Float[np.ndarray, "n r"]) -> None:
 def check_positions(what: str, positions: Float[np.ndarray, "*n k"]) -> None:
     """Raises a `UserError` for invalid positions."""
     furthest = 1e4  # largest coordinate, metres
-    if not (np.abs(positions) < furthest).all():
-        raise UserError(f"{what} must be coordinates in metres, each less than {furthest:g} m from the origin")
+    if not (inside := np.abs(positions) < furthest).all():
+        number = int(np.argwhere(~np.atleast_2d(inside))[0, 0])
+        raise UserError(
+            f"{what} must be coordinates in metres, each less than {furthest:g} m from the origin; number {number + 1} is "
+            f"{np.atleast_2d(positions)[number].tolist()}"
+        )
 
 
 def check_metres(what: str, positions: Float[np.ndarray, "n k"]) -> None:
@@ -240,7 +261,17 @@ def check_metres(what: str, positions: Float[np.ndarray, "n k"]) -> None:
 
 
 def check_frame(what: str, places: Float[np.ndarray, "n 3"], receivers: Float[np.ndarray, "r 3"]) -> None:
-    """Raises a `UserError` for positions in degrees with receivers in metres."""
+    """Raises a `UserError` for positions in degrees with receivers in metres, and for heights in another unit than the
+    receivers'."""
+    every = np.concatenate([places, receivers])
+    tower = 100.0  # metres: height above the readings that only another unit explains, if it is also their largest extent
+    aside = float(np.linalg.norm(np.ptp(every[:, :2], axis=0)))
+    low, high = sorted((places[:, 2], receivers[:, 2]), key=np.mean)
+    if (gap := float(high.min() - low.max())) > max(tower, 3 * aside):
+        raise UserError(
+            f"{what} and receivers are {gap:.3g} m apart in height, but at most {aside:.3g} m in plan; give heights z of both "
+            "in metres, from one origin"
+        )
     plane = np.unique(places[:, :2], axis=0)
     extent = np.ptp(plane, axis=0).max()
     nearest = np.linalg.norm(receivers[:, :2] - plane.mean(0), axis=1).min()
