@@ -148,7 +148,12 @@ def _fault_of_snapshots(values: np.ndarray) -> str:
     finite, missing = np.isfinite(values).all(-1), np.isnan(values).all(-1)
     if not (finite | missing).all():
         return "infinity, or NaN in only some elements of a link"
-    return "" if finite.any() else "only NaN"
+    if not finite.any():
+        return "only NaN"
+    known = values[finite]
+    if not known.any():
+        return "only 0: nothing was received anywhere"
+    return "real numbers (give complex voltages, not magnitudes)" if known.shape[-1] > 1 and not known.imag.any() else ""
 
 
 def _fault_of_images(values: np.ndarray) -> str:

@@ -465,5 +465,7 @@ def test_files_in_other_spellings(folder, recwarn):
     np.testing.assert_array_equal(load_layout(folder).observations["pas"], before.observations["pas"])
     assert not any("is not read" in str(note.message) for note in recwarn)
     (folder / "point_cloud.ply").unlink()
-    with pytest.warns(UserWarning, match=r"room\.glb is not read; convert it .*: wbgs-jax convert room\.glb --out room\.npz"):
+    with pytest.warns(
+        UserWarning, match=r"room\.glb is not read; if .*, convert it: wbgs-jax convert room\.glb --out room\.npz"
+    ):
         load_layout(folder)

@@ -247,7 +247,7 @@ def test_released_scenes_are_looked_for_in_the_repository(monkeypatch):
         ("snapshots", np.full((5, 1, 3, 16), np.nan, np.complex64), "snapshots contains only NaN"),
         ("snapshots", np.full((5, 1, 3, 16), [np.nan] + [1.0 + 0j] * 15), "or NaN in only some elements of a link"),
         ("snapshots", np.ones((5, 1, 3, 16)), "snapshots must be a 4-D complex64"),
-        ("snapshots", np.full((5, 1, 3, 16), 1e300 + 0j), "snapshots contains infinity"),
+        ("snapshots", np.full((5, 1, 3, 16), 1e300 + 1e300j), "snapshots contains infinity"),
         ("snapshots", np.zeros((5, 3, 16), np.complex64), "snapshots must be a 4-D complex64"),
         ("snapshots", np.zeros((5, 1, 3, 16), "U1"), "snapshots must be a 4-D complex64"),
         ("snapshots", None, "it contains none of pas, snapshots, power_db"),

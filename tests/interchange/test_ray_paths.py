@@ -138,7 +138,7 @@ def test_gains_of_lines_of_sight_that_cannot_be_are_noted(rng, recwarn):
     """At another frequency, with a transmitted power, as powers or half the decibels; antennas have patterns and losses."""
     arrays = sight_lines(rng)
     a = arrays["a"]
-    for usual in (a, 3 * a * rng.uniform(0.2, 1, a.shape), 1e-3 * a / np.abs(a).max()):
+    for usual in (a, 3 * a * rng.uniform(0.2, 1, a.shape)):
         check_paths(from_sionna(arrays | {"a": usual}, 5e9), "hall")
     assert not recwarn
     cases = (

@@ -409,6 +409,19 @@ def test_rooms_on_their_side_are_refused(tmp_path):
     assert one.mesh.extents[2] == pytest.approx(2.5)
 
 
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        ({"asset": {"version": "1.0"}}, "is of glTF version 1; export it as glTF 2.0"),
+        ({"extensions": {"CESIUM_RTC": {"center": [100, 0, 0]}}}, "a centre for all objects .CESIUM_RTC., which is not"),
+    ],
+)
+def test_gltf_of_other_versions_and_centres_is_refused(tmp_path, extra, words):
+    (tmp_path / "a.gltf").write_text(json.dumps({"asset": {"version": "2.0"}} | extra))
+    with pytest.raises(UserError, match=f"a.gltf .*{words}"):
+        read_objects(tmp_path / "a.gltf")
+
+
 @pytest.mark.skipif(not CASES.exists(), reason="the small inputs are not beside the repository")
 def test_small_inputs_that_were_read_wrongly():
     for path in sorted((CASES / "polygons").glob("*")):

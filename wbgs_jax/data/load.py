@@ -20,6 +20,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.conventions import ConventionName
 from wbgs_jax.data.dataset import Dataset, Materials
 from wbgs_jax.data.scene_file import TEST, TRAIN, VALIDATION, Room, SceneFile, load_scene
+from wbgs_jax.data.snapshot_frames import other_convention
 from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters
 from wbgs_jax.observation_kinds import only_kind
 from wbgs_jax.types import Receiver, make_receiver, stack_receivers
@@ -239,6 +240,8 @@ def scene_dataset(scene: SceneFile) -> Dataset:
         face_part=scene.face_part,
         materials=materials_of(Room(scene.vertices, scene.faces, scene.face_part, scene.meta.get("parts", [])), scene.name),
     )
+    if reason := other_convention(dataset):
+        warnings.warn(f"{scene.name}: {reason}", stacklevel=2)
     return check_surroundings(dataset)
 
 

@@ -193,7 +193,7 @@ def _choose(found: FileObject, chosen: dict[str, Slab], where: str) -> Slab | No
 
 def _read_toml(file: Path) -> dict[str, dict[str, Any]]:
     try:
-        tables = tomllib.loads(file.read_text(encoding="utf-8"))
+        tables = tomllib.loads(file.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise UserError(f"cannot read {file}: {error.strerror}; give the .toml with the materials") from error
     except ValueError as error:  # TOMLDecodeError, UnicodeDecodeError

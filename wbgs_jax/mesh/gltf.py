@@ -137,6 +137,10 @@ def read_gltf(file: Path) -> list[Body]:
         if name not in SUPPORTED and not name.startswith(APPEARANCE):
             where = _first_object(document, name)
             raise UserError(f"{file} requires the extension {name}{where}, which is not supported; export it without")
+    if str(document.get("asset", {}).get("version", "2"))[:1] == "1":
+        raise UserError(f"{file} is of glTF version 1; export it as glTF 2.0")
+    if "CESIUM_RTC" in document.get("extensions", {}):
+        raise UserError(f"{file} has a centre for all objects (CESIUM_RTC), which is not supported; export it without")
     roots = _roots(document)
     bodies: list[Body] = []
     for number in roots:

@@ -131,7 +131,7 @@ BUILT_IN: dict[str, Callable[[ET.Element], trimesh.Trimesh]] = {
 
 
 def _value(shape: ET.Element, name: str, missing: float) -> float:
-    found = next((one for one in shape if one.tag in ("float", "integer") and one.get("name") == name), None)
+    found = next((one for one in shape if one.get("name") == name), None)  # a float or an integer, or text by mistake
     return missing if found is None else float(found.get("value", missing))
 
 
