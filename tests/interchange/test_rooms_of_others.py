@@ -422,6 +422,18 @@ def test_gltf_of_other_versions_and_centres_is_refused(tmp_path, extra, words):
         read_objects(tmp_path / "a.gltf")
 
 
+def test_thickness_as_text_and_materials_after_a_byte_order_mark(tmp_path):
+    material = (
+        '<bsdf type="itu-radio-material" id="m"><string name="type" value="concrete"/><string name="thickness" value="0.3"/>'
+    )
+    (tmp_path / "a.xml").write_text(f'<scene>{material}</bsdf><shape type="cube" id="c"><ref id="m"/></shape></scene>')
+    (one,) = read_room(tmp_path / "a.xml")
+    assert one.slab[:2] == ("concrete", 0.3)
+    (tmp_path / "m.toml").write_bytes(b'\xef\xbb\xbf[objects]\nc = "wood"\n')
+    (one,) = read_room(tmp_path / "a.xml", tmp_path / "m.toml")
+    assert one.slab.material == "wood"
+
+
 @pytest.mark.skipif(not CASES.exists(), reason="the small inputs are not beside the repository")
 def test_small_inputs_that_were_read_wrongly():
     for path in sorted((CASES / "polygons").glob("*")):
