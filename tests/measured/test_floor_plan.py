@@ -96,9 +96,21 @@ def test_walls_stand_between_floor_and_ceiling(tmp_path):
     np.testing.assert_allclose(mesh.area, 2.5 * (5 + 3) + 2 * 5 * 3)
 
 
+def test_classes_of_walls_are_read(tmp_path):
+    path = tmp_path / "walls.csv"
+    path.write_text("x1,y1,x2,y2,material\n0,0,5,0,Glass\n5,0,5,3,concrete\n5,3,0,3,glass \n")
+    walls = load_walls(path)
+    assert walls.classes == ("concrete", "glass")
+    np.testing.assert_array_equal(walls.of_class, [[0, 1], [1, 0], [0, 1]])
+    path.write_text("x1,y1,x2,y2,type\n0,0,5,0,brick\n5,0,5,3,brick\n")
+    assert load_walls(path).of_class is None
+
+
 @pytest.mark.parametrize(
     ("content", "says"),
     [
+        ("x1,y1,x2,y2,type,class\n0,0,5,0,a,b\n", "has the columns 'class' and 'type'"),
+        ("x1,y1,x2,y2,type\n" + "".join(f"0,0,5,{k},{k}\n" for k in range(11)), "has 11 different values in the column 'type'"),
         ("x,z\n1,2\n", "has no column 'y'"),
         ("x1,y1,x2,y2\n1,2,3,\n", "corners must be coordinates in metres"),
         ("x,y\n1,1e300\n2,2\n", "corners must be coordinates in metres"),

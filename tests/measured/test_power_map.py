@@ -197,6 +197,26 @@ def test_the_map_is_no_worse_than_any_rival(kind, rng):
             assert off.mean() < np.abs(other - heard).mean() + 0.25, rival
 
 
+def test_classes_of_walls_have_losses_of_their_own(rng):
+    """Glass and concrete between rooms in a row; one class only is no class."""
+    x = np.arange(5.0, 40, 5)
+    ends, concrete = np.array([[[at, 0.0], [at, 10.0]] for at in x]), np.arange(len(x)) % 3 == 0
+    walls = Walls(ends, np.ones(len(x)), np.stack([concrete, ~concrete], 1).astype(float), ("concrete", "glass"))
+    tx = np.column_stack([rng.uniform(0, 40, 300), rng.uniform(0, 10, 300), np.full(300, 1.3)])
+    receivers = np.column_stack([np.linspace(1, 39, 6), rng.uniform(0, 10, 6), np.full(6, 2.5)])
+    between = (x > np.minimum(tx[:, None, :1], receivers[:, :1])) & (x < np.maximum(tx[:, None, :1], receivers[:, :1]))
+    loss = np.sum(between * np.where(concrete, 14.0, 3.0), -1) / np.sqrt(np.maximum(between.sum(-1), 1))
+    heard = -40 - 20 * np.log10(np.linalg.norm(tx[:, None] - receivers, axis=-1)) - loss + rng.normal(0, 3, loss.shape)
+    cells = Readings(tx, heard, np.ones_like(heard), ("",) * 300, receivers)
+    law = np.asarray(learn_map(cells, walls).law)
+    np.testing.assert_allclose(law[2] + law[4:], [14, 3], atol=1.5)
+    alike = dataclasses.replace(walls, of_class=None, classes=())
+    assert len(learn_map(cells, alike).law) == 4
+    out = [tx[:, 0] > 30]
+    errors = [np.abs(_mapped(out, cells, plan)[0] - heard)[out[0]].mean() for plan in (walls, alike)]
+    assert errors[0] + 0.5 < errors[1]
+
+
 def test_ceilings_lie_between_storeys():
     np.testing.assert_allclose(find_ceilings(np.array([1.3, 7.5, 4.4, 1.3])), [3.1, 6.2])
     np.testing.assert_allclose(find_ceilings(np.array([0.5, 2.5])), [1.5])  # a person carries nothing below the middle

@@ -112,12 +112,14 @@ def answers(learned: PowerMap, places: Float[np.ndarray, "tx 3"], where: Domain)
 def report(learned: PowerMap, found: list[Score], command: Command, size: float) -> dict[str, Any]:
     """Returns the content of a results file."""
     law, scales = (np.asarray(a, float).round(4).tolist() for a in (learned.law, learned.scales))
+    names = ["dbm_at_one_metre", "exponent", "first_wall_db", "first_ceiling_db"]
+    names += [f"besides_{_key(name)}_db" for name in learned.walls.classes]
     assert command.data is not None, "checked"
     return {
         "data": command.data.resolve().name,
         "attribution": attribution(command.data),
         "cell_m": size,
-        "law": dict(zip(("dbm_at_one_metre", "exponent", "first_wall_db", "first_ceiling_db"), law, strict=True)),
+        "law": dict(zip(names, law, strict=True)),
         "scales": dict(zip((field.name for field in dataclasses.fields(Scales)), scales, strict=True)),
         "scores": {_key(score.held_out): _as_json(score) for score in found},
         "environment": environment(),

@@ -1,8 +1,8 @@
 """Walls of a floor plan: the number of walls between two points, and a mesh of the walls.
 
-walls.csv (or layout.csv) has segments x1,y1,x2,y2, one per wall, or the corners x,y of an outline of free space, in which a
-wall between rooms has two faces. A column `room` separates several outlines, or empty lines, or the first corner of each at its
-end. Metres.
+walls.csv (or layout.csv) has segments x1,y1,x2,y2, one per wall, optionally with the class of each (`material`), or the corners
+x,y of an outline of free space, in which a wall between rooms has two faces. A column `room` separates several outlines, or
+empty lines, or the first corner of each at its end. Metres.
 """
 
 from dataclasses import dataclass
@@ -15,10 +15,12 @@ import trimesh
 from jaxtyping import Array, Float, Int
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.pytree import pytree
+from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.data.tables import check_positions, numbers, read_lines, read_table
 
 FILES = ("walls.csv", "layout.csv")
+CLASSES = ("material", "class", "type")
+"""Names of the column of segments with the class of each wall."""
 ON_WALL = 1e-2
 """Metres: a point this near to a wall counts as lying on it, and the wall as no obstacle."""
 
@@ -31,6 +33,10 @@ class Walls:
     """End points of every wall on the floor, metres."""
     share: Float[Array | np.ndarray, " w"]
     """Weight: 1, or 1/2 for each face of a wall drawn with two faces."""
+    of_class: Float[Array | np.ndarray, "w c"] | None = None
+    """1 where a wall belongs to a class, else 0; None without classes."""
+    classes: tuple[str, ...] = static(default=())
+    """Names of the classes."""
 
 
 NO_WALLS = Walls(np.zeros((0, 2, 2)), np.zeros(0))
@@ -61,17 +67,16 @@ def load_walls(path: Path) -> Walls:
     form = SEGMENTS if SEGMENTS.columns[0] in header else OUTLINE
     values = numbers(path, header, rows, list(form.columns))
     check_positions(f"{path}: corners", values)
-    # Names of columns that are ignored: the path loss law treats all walls equally.
-    ignored = ("id", "name", "material", "thickness", "comment", "note")
+    ignored = ("id", "name", "thickness", "comment", "note")  # names of columns that are not used
     outline_column = "room"  # column that separates outlines
-    allowed = (*form.columns, *ignored, *([] if form is SEGMENTS else [outline_column]))
+    allowed = (*form.columns, *ignored, *(CLASSES if form is SEGMENTS else (CLASSES[0], outline_column)))
     if other := [name for name in header if name not in allowed]:
         raise UserError(
             f"{path} has an unknown column {other[0]!r}; the columns of a floor plan are {', '.join(form.columns)}"
             + (f" and, for several outlines, {outline_column}" if form is OUTLINE else "")
         )
     if form is SEGMENTS:
-        return Walls(values.reshape(-1, 2, 2), np.full(len(values), form.share))
+        return Walls(values.reshape(-1, 2, 2), np.full(len(values), form.share), *_classes(path, header, rows))
     if outline_column in header:
         room = np.array([row[header.index(outline_column)] for row in rows])
         outlines = [values[room == one] for one in dict.fromkeys(room.tolist())]
@@ -80,6 +85,22 @@ def load_walls(path: Path) -> Walls:
     outlines = [ring for corners in outlines for ring in _rings(path, corners)]
     ends = np.concatenate([np.stack([corners, np.roll(corners, -1, 0)], 1) for corners in outlines])
     return Walls(ends, np.full(len(ends), form.share))
+
+
+def _classes(path: Path, header: list[str], rows: list[list[str]]) -> tuple[Float[np.ndarray, "w c"] | None, tuple[str, ...]]:
+    """Returns which walls belong to which class, and the names of the classes; none if there is only one."""
+    named = [name for name in CLASSES if name in header]
+    if len(named) > 1:
+        raise UserError(f"{path} has the columns {named[0]!r} and {named[1]!r}; name the class of a wall in one of them")
+    if not named:
+        return None, ()
+    own = [row[header.index(named[0])].strip().lower() for row in rows]
+    classes, most = tuple(sorted(set(own))), 10
+    if len(classes) > most:
+        raise UserError(f"{path} has {len(classes)} different values in the column {named[0]!r}; at most {most} can be learned")
+    if len(classes) == 1:
+        return None, ()
+    return np.array([[1.0 * (name == one) for one in classes] for name in own]), classes
 
 
 def _gaps(path: Path) -> Int[np.ndarray, " g"]:
@@ -117,6 +138,13 @@ def crossings(
     walls: Walls, start: Float[Array | np.ndarray, "*#n 2"], goal: Float[Array | np.ndarray, "*#n 2"]
 ) -> Float[Array | np.ndarray, "*#n"]:
     """Returns the number of walls between points of the plan; walls that contain one of the points do not count."""
+    return namespace(start).sum(crossed(walls, start, goal), -1)
+
+
+def crossed(
+    walls: Walls, start: Float[Array | np.ndarray, "*#n 2"], goal: Float[Array | np.ndarray, "*#n 2"]
+) -> Float[Array | np.ndarray, "*#n w"]:
+    """Returns the weights of the walls between points of the plan, 0 for all others."""
     xp, along = namespace(start), walls.ends[:, 1] - walls.ends[:, 0]
     ray, corner = (goal - start)[..., None, :], walls.ends[:, 0] - start[..., None, :]
     ground = _cross(ray, along)
@@ -127,7 +155,7 @@ def crossings(
     apart = xp.abs(ground) / xp.where(long > 0, long, 1.0)  # distance between the two points, perpendicular to the wall
     near = xp.minimum(on_ray, 1 - on_ray) * apart  # distance of the nearer point from the wall
     hit = (xp.abs(ground) >= parallel) & (near > ON_WALL) & (on_wall >= 0) & (on_wall < 1)
-    return xp.sum(xp.where(hit, walls.share, 0.0), -1)
+    return xp.where(hit, walls.share, 0.0)
 
 
 def _cross(a: Any, b: Any) -> Any:

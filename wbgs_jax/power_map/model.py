@@ -6,10 +6,11 @@ storeys, and a Gaussian process for its residuals.
 with d the distance to receiver r, w the number of walls and k the number of ceilings in between. Further walls and ceilings
 cost less than the first one, since waves through doors, around corners and along facades do not cross them: L(k) is the
 decreasing loss of further floors of the multi-wall model (COST 231, final report, section 4.7), and sqrt(w) its counterpart for
-walls. The law is common to all receivers and fitted by least squares, in which the readings of one square metre count as one,
-so that it holds where nothing was measured. The residuals are the gain g of a receiver, u, due to rooms and furniture, and v,
-due to individual walls. A part of u decays within a metre, as v does, another one over rooms (exponential covariances;
-Rasmussen and Williams 2006, chapter 2). Its length and all shares follow from the data (`scales.learn_scales`).
+walls; if walls have classes, l is a mean over those in between. The law is common to all receivers and fitted by least squares,
+in which the readings of one square metre count as one, so that it holds where nothing was measured. The residuals are the gain
+g of a receiver, u, due to rooms and furniture, and v, due to individual walls. A part of u decays within a metre, as v does,
+another one over rooms (exponential covariances; Rasmussen and Williams 2006, chapter 2). Its length and all shares follow from
+the data (`scales.learn_scales`).
 """
 
 from functools import partial
@@ -23,7 +24,7 @@ from scipy.linalg import cho_solve, solve_triangular
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
-from wbgs_jax.data.floor_plan import NO_WALLS, Walls, crossings, namespace
+from wbgs_jax.data.floor_plan import NO_WALLS, Walls, crossed, namespace
 from wbgs_jax.data.rssi_folder import Readings
 from wbgs_jax.power_map.scales import Scales, covariance, distances, learn_scales, noise
 from wbgs_jax.radio.array import EXACT
@@ -32,6 +33,8 @@ LAW = np.array([-45.0, 2.0, 6.0, 15.0])
 """Prior means of the power at one metre (dBm), the exponent, the loss of a wall and of a ceiling (dB), ..."""
 LAW_WIDTH = np.array([30.0, 1.0, 4.0, 8.0])
 """... and their prior standard deviations."""
+CLASS_WIDTH = 4.0
+"""Prior standard deviation of what walls of a class lose besides, dB."""
 APART = 5.0
 """Standard deviation of the error of the law where readings within a metre count as one, dB."""
 NEAREST = 0.1
@@ -51,9 +54,10 @@ class PowerMap:
     ceilings: Float[Array, " c"]
     """Heights of the ceilings between storeys, metres."""
     places: Float[Array, "n 3"]
-    law: Float[Array, "4"]
-    """Power at one metre (dBm), exponent, loss of the first wall and of the first ceiling (dB)."""
-    law_covariance: Float[Array, "4 4"]
+    law: Float[Array, " k"]
+    """Power at one metre (dBm), exponent, loss of the first wall and of the first ceiling (dB), and what the first wall of each
+    class loses besides (dB)."""
+    law_covariance: Float[Array, "k k"]
     scales: Float[Array, "7"]
     """The values of `Scales`, in order."""
     root_walls: Float[Array, "n r"]
@@ -134,22 +138,31 @@ def find_ceilings(heights: Float[np.ndarray, " n"]) -> Float[np.ndarray, " c"]:
 
 
 def law_features(tx: Any, receivers: Any, walls: Walls, ceilings: Any) -> Any:
-    """Returns the factors (b, r, 4) of the law's four parameters."""
+    """Returns the factors (b, r, 4 + c) of the law's parameters: the four of all walls, and the further loss of each class."""
     xp = namespace(tx)
     distance = xp.maximum(distances(tx, receivers), NEAREST)
-    between = crossings(walls, tx[:, None, :2], receivers[None, :, :2])
+    each = crossed(walls, tx[:, None, :2], receivers[None, :, :2])
+    between = xp.sum(each, -1)
     root = xp.sqrt(xp.where(between > 0, between, 1.0)) * (between > 0)
     below = [xp.sum(at[:, 2, None] > ceilings, -1) for at in (tx, receivers)]
     storeys = xp.abs(below[0][:, None] - below[1])
     decrease = 0.46  # b of COST 231, section 4.7
     further = xp.maximum(storeys, 1) ** ((storeys + 2) / (storeys + 1) - decrease) * (storeys > 0)
-    return xp.stack([xp.ones_like(distance), -10 * xp.log10(distance), -root, -further], -1)
+    law = xp.stack([xp.ones_like(distance), -10 * xp.log10(distance), -root, -further], -1)
+    if walls.of_class is None:
+        return law
+    of_class = (
+        -(each @ walls.of_class) / xp.where(between > 0, root, 1.0)[..., None]
+    )  # -sqrt(w) times the fraction of the class
+    return xp.concatenate([law, of_class], -1)
 
 
 def fit_law(
-    readings: Readings, features: Float[np.ndarray, "n r 4"]
-) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "4 4"]]:
+    readings: Readings, features: Float[np.ndarray, "n r k"]
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
     """Returns the law by least squares with a normal prior, and its covariance."""
+    classes = features.shape[-1] - len(LAW)
+    prior, width = np.append(LAW, np.zeros(classes)), np.append(LAW_WIDTH, np.full(classes, CLASS_WIDTH))
     side = 1.0  # metres: the readings within a cube of this size count as one reading in the fit of the law
     _, cube = np.unique(np.floor(readings.places / side).astype(int), axis=0, return_inverse=True)
     received = np.isfinite(readings.powers)
@@ -157,10 +170,10 @@ def fit_law(
     for r in range(len(readings.receivers)):
         own = cube.reshape(-1)[received[:, r]]
         weights[received[:, r], r] = 1 / (APART**2 * np.bincount(own, minlength=cube.max() + 1)[own])
-    left = np.where(received, readings.powers - features @ LAW, 0)
-    precision = np.einsum("nri,nr,nrj->ij", features, weights, features) + np.diag(LAW_WIDTH**-2.0)
+    left = np.where(received, readings.powers - features @ prior, 0)
+    precision = np.einsum("nri,nr,nrj->ij", features, weights, features) + np.diag(width**-2.0)
     law_covariance = np.linalg.inv(precision)
-    return LAW + law_covariance @ np.einsum("nri,nr,nr->i", features, weights, left), law_covariance
+    return prior + law_covariance @ np.einsum("nri,nr,nr->i", features, weights, left), law_covariance
 
 
 def covariance_of_powers(
