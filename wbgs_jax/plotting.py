@@ -3,7 +3,7 @@ of a run; every quantity that `wbgs-jax predict` provides; maps of a quantity ov
 received power over a floor plan.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
 from wbgs_jax import metrics
 from wbgs_jax._util.cli import point_words
@@ -28,6 +28,7 @@ from wbgs_jax.data.floor_plan import Walls
 from wbgs_jax.data.rssi_folder import Readings
 from wbgs_jax.inference.quantities import NETWORK, QUANTITIES, Quantity
 from wbgs_jax.inference.queries import Queries, shown_rows
+from wbgs_jax.panels import clipped, make_panels, name_axes, name_curves, name_frequencies
 from wbgs_jax.power_map.model import PowerMap, received_power
 from wbgs_jax.radio.channel import NO_PATH_DB
 
@@ -244,37 +245,6 @@ def _link_titles(queries: Queries) -> list[str]:
     return [f"{hertz / 1e9:.4g} GHz, TX {point_words(place)}" for place, hertz in zip(positions, frequencies, strict=True)]
 
 
-def _panels(titles: list[str], columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, list[Axes]]:
-    """Returns a figure with a panel for each title; `size` is that of a panel in inches."""
-    columns = min(columns, len(titles))
-    rows = -(-len(titles) // columns)
-    figure = Figure(figsize=(size[0] * columns + 0.8, size[1] * rows + 0.8), layout="constrained")
-    axes = list(figure.subplots(rows, columns, squeeze=False, **options).flat)
-    for axis in axes[len(titles) :]:
-        axis.axis("off")
-    for axis, title in zip(axes, titles, strict=False):
-        axis.set_title(title, fontsize=9)
-    return figure, axes[: len(titles)]
-
-
-def _name_axes(axes: Iterable[Axes], x: str, y: str) -> None:
-    """Names the axes of panels that share them, at the left and where no panel is below."""
-    panels = [axis for axis in axes if axis.axison]
-    columns = panels[0].get_subplotspec().get_gridspec().ncols  # type: ignore[union-attr]
-    for number, axis in enumerate(panels):
-        if number + columns >= len(panels):
-            axis.set_xlabel(x, fontsize=9)
-            axis.tick_params(labelbottom=True)
-        if number % columns == 0:
-            axis.set_ylabel(y, fontsize=9)
-
-
-def _clipped(values: Float[np.ndarray, "*shape"], vmin: float, vmax: float) -> Any:
-    """Returns at which ends a colour bar needs an arrow, because values lie beyond it."""
-    below, above = bool((values < vmin).any()), bool((values > vmax).any())
-    return {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}[below, above]
-
-
 def _amplitude_db(amplitude: Any) -> Float[np.ndarray, "*shape"]:
     """Returns powers of complex amplitudes in dB; NaN where nothing arrives."""
     power = np.abs(np.asarray(amplitude, np.complex128)) ** 2
@@ -287,11 +257,11 @@ def draw_answers(found: Mapping[str, np.ndarray], queries: Queries) -> Figure:
     titles = _link_titles(queries)
     for i, (ssim, low, high) in enumerate(found.get("expected", ())):
         titles[i] += "" if np.isnan(ssim) else f"\nexpected SSIM {ssim:.2f} ({low:.2f} to {high:.2f})"
-    figure, axes = _panels(titles, 2, (5.4, 2.1), sharex=True, sharey=True)
+    figure, axes = make_panels(titles, 2, (5.4, 2.1), sharex=True, sharey=True)
     for axis, pas in zip(axes, found["pas"], strict=True):
         shown = axis.imshow(pas, vmin=0, vmax=1, cmap=COLORS, extent=(-180, 180, 90, 0), aspect="auto")
         axis.set(xticks=range(-180, 181, 90), yticks=(0, 45, 90))
-    _name_axes(axes, "azimuth [deg]", "zenith [deg]")
+    name_axes(axes, "azimuth [deg]", "zenith [deg]")
     figure.colorbar(shown, ax=axes, shrink=0.8, label="normalised amplitude")
     return figure
 
@@ -307,7 +277,7 @@ def draw_paths(
     if "points_m" not in found:
         raise UserError("the paths of this field have no points to draw; give --out paths.csv, and no --picture")
     positions, frequencies = queries.flat()
-    figure, axes = _panels(_link_titles(queries), 2, (4.6, 3.9), sharex=True, sharey=True)
+    figure, axes = make_panels(_link_titles(queries), 2, (4.6, 3.9), sharex=True, sharey=True)
     figure.set_layout_engine("compressed")  # panels keep their aspect
     shown = ScalarMappable(Normalize(-FADED_DB, 0), "plasma")
     link = np.stack([found[name] for name in ("x", "y", "z", "frequency_ghz")], -1)
@@ -334,7 +304,7 @@ def draw_paths(
         words = f"{len(strong)} of {len(own)} paths, the strongest {top:.1f} dB of the transmitted" if len(own) else "no paths"
         axis.set_title(f"{axis.get_title()}\n{words}", fontsize=8)
     axes[0].legend(fontsize=8, loc="upper right")
-    _name_axes(axes, "x [m]", "y [m]")
+    name_axes(axes, "x [m]", "y [m]")
     figure.colorbar(shown, ax=axes, shrink=0.8, label="power of a path [dB of the strongest]")
     return figure
 
@@ -354,7 +324,7 @@ def draw_responses(found: Mapping[str, np.ndarray], queries: Queries) -> Figure:
     below.set(xlabel="delay, modulo the longest one shown [ns]", ylabel=f"impulse response,\n{unit}")
     if np.isfinite(impulses).any():
         below.set_ylim(np.nanmax(impulses) - FADED_DB, np.nanmax(impulses) + 3)
-    _name_curves(above)
+    name_curves(above)
     for axis in (above, below):
         axis.grid(alpha=0.3)
     return figure
@@ -362,14 +332,14 @@ def draw_responses(found: Mapping[str, np.ndarray], queries: Queries) -> Figure:
 
 def draw_matrices(matrices: Complex[np.ndarray, "n elements m"], queries: Queries) -> Figure:
     """Returns a figure of MIMO matrices, powers in dB."""
-    figure, axes = _panels(_link_titles(queries), 3, (3.4, 3.6), sharex=True, sharey=True)
+    figure, axes = make_panels(_link_titles(queries), 3, (3.4, 3.6), sharex=True, sharey=True)
     values = _amplitude_db(matrices)
     span: Any = {"vmin": float(np.nanmin(values)), "vmax": float(np.nanmax(values))} if np.isfinite(values).any() else {}
     elements, columns = matrices.shape[1:]
     for axis, value in zip(axes, values, strict=True):
         shown = axis.imshow(value, cmap=COLORS, aspect="auto", extent=(0.5, columns + 0.5, elements + 0.5, 0.5), **span)
         axis.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
-    _name_axes(axes, "number of the transmitter's element", "number of the receiver's element")
+    name_axes(axes, "number of the transmitter's element", "number of the receiver's element")
     figure.colorbar(shown, ax=axes, shrink=0.8, label="power of the channel [dB of the transmitted]")
     return figure
 
@@ -385,17 +355,10 @@ def draw_snapshots(snapshots: Complex[np.ndarray, "n elements"], queries: Querie
         axes[1].plot(numbers, np.degrees(np.angle(values)), **style)
     axes[0].set_ylabel("power [dB of the transmitted]")
     axes[1].set(xlabel="number of the receiver's element", ylabel="phase [deg]", ylim=(-185, 185), yticks=range(-180, 181, 90))
-    _name_curves(axes[0])
+    name_curves(axes[0])
     for axis in axes:
         axis.grid(alpha=0.3)
     return figure
-
-
-def _name_curves(axis: Axes, title: str = "") -> None:
-    """Adds a legend, beside the axes if it is so long that it would hide curves."""
-    most_within = 5  # curves
-    beside: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.01, 1), "borderaxespad": 0}
-    axis.legend(fontsize=8, title=title, **beside if len(axis.get_legend_handles_labels()[1]) > most_within else {})
 
 
 def _shares(count: int) -> Float[np.ndarray, " n"]:
@@ -447,7 +410,7 @@ def draw_sweeps(quantity: Quantity, found: Mapping[str, np.ndarray], queries: Qu
     if values.shape[-1] > 1:
         label = label.replace("the azimuth", "azimuth (filled) and\nzenith (open, dashed)")
     if legend != [""]:
-        _name_curves(axis, "" if len(chosen) == len(curves) else f"{len(chosen)} of {len(curves)}")
+        name_curves(axis, "" if len(chosen) == len(curves) else f"{len(chosen)} of {len(curves)}")
     axis.set_ylabel(label)
     axis.grid(alpha=0.3)
     return figure
@@ -460,7 +423,7 @@ def _places(axis: Axes, queries: Queries) -> tuple[Float[np.ndarray, " n"], list
         axis.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
         return np.arange(1, len(queries) + 1.0), [""]
     if len(queries.frequencies_hz) > len(queries.tx_positions):
-        _name_frequencies(axis, queries.frequencies_hz / 1e9)
+        name_frequencies(axis, queries.frequencies_hz / 1e9)
         return queries.frequencies_hz / 1e9, [f"TX {point_words(tx)}" for tx in queries.tx_positions]
     steps = np.linalg.norm(np.diff(queries.tx_positions, axis=0), axis=-1)
     first, last = (point_words(queries.tx_positions[i]) for i in (0, -1))
@@ -469,16 +432,6 @@ def _places(axis: Axes, queries: Queries) -> tuple[Float[np.ndarray, " n"], list
     else:
         axis.set_xticks([0.0], [f"TX {first}"])
     return np.concatenate([[0.0], np.cumsum(steps)]), [f"{frequency / 1e9:.4g} GHz" for frequency in queries.frequencies_hz]
-
-
-def _name_frequencies(axis: Axes, ghz: Float[np.ndarray, " n"]) -> None:
-    """Names an axis of frequencies, logarithmic if they span more than a factor of three."""
-    axis.set_xlabel("frequency [GHz]")
-    if ghz.max() > 3 * ghz.min():
-        axis.set_xscale("log")
-        axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.xaxis.set_major_formatter("{x:g}")
-        axis.xaxis.set_minor_formatter(NullFormatter())
 
 
 def draw_channel(found: Mapping[str, np.ndarray], source: Mapping[str, Any], frequency_hz: float) -> Figure:
@@ -492,7 +445,7 @@ def draw_channel(found: Mapping[str, np.ndarray], source: Mapping[str, Any], fre
     bars = {"vmin": float(doppler.max()) - FADED_DB, "vmax": float(doppler.max())}
     shown = below.pcolormesh(found["doppler_time_s"], found["doppler_hz"], doppler, cmap=COLORS, shading="nearest", **bars)
     below.set(xlabel="time [s]", ylabel="Doppler shift [Hz]")
-    figure.colorbar(shown, ax=below, label="power [dB of the transmitted]", extend=_clipped(doppler, **bars))
+    figure.colorbar(shown, ax=below, label="power [dB of the transmitted]", extend=clipped(doppler, **bars))
     figure.suptitle(f"{origin_words(source)}, {frequency_hz / 1e9:g} GHz", fontsize=9)
     return figure
 
@@ -529,10 +482,10 @@ def draw_maps(what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray,
         axis.set(xlim=extent[:2], ylim=extent[2:])
         axis.set_title(f"{answer['frequencies_hz'][i] / 1e9:g} GHz", fontsize=10)
     axes[0, 0].legend(fontsize=8, loc="upper right")
-    _name_axes(axes.flat, "x [m]", "y [m]")
+    name_axes(axes.flat, "x [m]", "y [m]")
     ends = "receivers" if network else "transmitters"
     figure.suptitle(f"{origin_words(source)}, {ends} {answer['height']:.3g} m high", fontsize=9)
-    bar = figure.colorbar(shown, ax=axes, shrink=0.8, label=quantity.label, extend=_clipped(values, **span))
+    bar = figure.colorbar(shown, ax=axes, shrink=0.8, label=quantity.label, extend=clipped(values, **span))
     if what == "best-server":
         bar.ax.set(ylim=(-0.5, len(stars) - 0.5), yticks=range(len(stars)))
     return figure
@@ -600,7 +553,7 @@ def draw_power_maps(learned: PowerMap, walls: Walls, cells: Readings) -> Figure:
     powers = map_blocks(lambda block: received_power(learned, jnp.asarray(block, jnp.float32))[0], pixels, 2048)
     titles = cells.titles[:most_receivers]
     width, depth = 4.1 * (high - low) / max(high - low)
-    figure, axes = _panels(titles, 3, (width, depth), sharex=True, sharey=True)
+    figure, axes = make_panels(titles, 3, (width, depth), sharex=True, sharey=True)
     norm = Normalize(*np.quantile(powers[:, : len(axes)], (0, 1)))
     extent = (low[0], low[0] + spacing * len(x), low[1], low[1] + spacing * len(y))
     for r, axis in enumerate(axes):
@@ -610,6 +563,6 @@ def draw_power_maps(learned: PowerMap, walls: Walls, cells: Readings) -> Figure:
         axis.plot(places[:, 0], places[:, 1], ".", color="black", markersize=1, alpha=0.5)
         axis.plot(*cells.receivers[r, :2], **STAR)
     axes[0].legend(fontsize=8, loc="upper right")
-    _name_axes(axes, "x [m]", "y [m]")
+    name_axes(axes, "x [m]", "y [m]")
     figure.colorbar(image, ax=axes, shrink=0.8, label=f"mean received power [dBm]\n{height:.2g} m above the floor")
     return figure

@@ -134,7 +134,7 @@ def found_without(*lost):
     n_paths = np.ones((20, 2), int)
     n_paths[list(lost), 1] = 0
     return {
-        "read_back_hz": np.array([2.4e9, 60e9]), "n_paths": n_paths, "snapshots": np.ones((20, 2, 16), np.complex64),
+        "read_back_hz": np.array([2.4e9, 60e9]), "n_paths": n_paths, "snapshots": np.full((20, 2, 16), 1j, np.complex64),
         "line_of_sight": n_paths > 0, "delay_spread_s": np.zeros((20, 2)), "ceilings": np.full((20, 2, 5), np.nan),
     }  # fmt: skip
 

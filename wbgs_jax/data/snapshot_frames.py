@@ -51,6 +51,6 @@ def _fit(
     elements = np.asarray(receivers.element_positions, np.float64)[which]
     if receivers.unit == "metres":
         elements = elements * (dataset.frequencies_hz[links] / SPEED_OF_LIGHT)[:, None, None]
-    wave = np.exp(2j * np.pi * np.einsum("nek,nk->ne", elements, local))
+    steering = np.exp(2j * np.pi * np.einsum("nek,nk->ne", elements, local))
     power = np.sum(np.abs(snapshots) ** 2, -1)
-    return np.abs(np.sum(wave.conj() * snapshots, -1)) ** 2 / np.maximum(wave.shape[1] * power, 1e-300)
+    return np.abs(np.sum(steering.conj() * snapshots, -1)) ** 2 / np.maximum(steering.shape[1] * power, 1e-300)
