@@ -85,8 +85,9 @@ def test_the_covariance_is_that_of_the_formula(rng):
             distance = np.linalg.norm(a[:, None] - b, axis=-1)
             walls, others = -phi(a)[:, 2], -phi(b)[:, 2]
             near = np.exp(-distance / LENGTH) * (scales.near**2 + scales.wall**2 * np.outer(walls, others))
-            behind = np.exp(-10 * np.abs(walls[:, None] - others))
-            return near + scales.far**2 * behind * np.exp(-distance / scales.length_m) + scales.gain**2
+            all_a, all_b = (np.sqrt(walls_between(at)) for at in (a, b))
+            room = np.exp(-10 * np.abs(all_a[:, None] - all_b).mean(-1))
+            return near + scales.far**2 * room * np.exp(-distance / scales.length_m) + scales.gain**2
 
         inverse = np.linalg.inv(k(tx[own], tx[own]) + (scales.place**2 + scales.reading**2) * np.eye(own.sum()))
         left = heard[own, r] - phi(tx[own]) @ law

@@ -26,7 +26,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.data.floor_plan import NO_WALLS, Walls, crossed, namespace
 from wbgs_jax.data.rssi_folder import Readings
-from wbgs_jax.power_map.scales import Scales, covariance, distances, learn_scales, noise
+from wbgs_jax.power_map.scales import Scales, covariance, distances, in_one_room, learn_scales, noise
 from wbgs_jax.radio.array import EXACT
 
 LAW = np.array([-45.0, 2.0, 6.0, 15.0])
@@ -118,13 +118,13 @@ def received_power(learned: PowerMap, tx_position: Float[Array, "b 3"]) -> tuple
     """
     features = law_features(tx_position, learned.receivers, learned.walls, learned.ceilings)
     scales, root_walls = Scales(*learned.scales), -features[..., 2]
-    apart = distances(tx_position, learned.places)[:, None]
-    k = covariance(scales, apart, root_walls[..., None], learned.root_walls.T)
+    apart, shared = distances(tx_position, learned.places), in_one_room(root_walls, learned.root_walls)
+    k = covariance(scales, apart[:, None], shared[:, None], root_walls[..., None], learned.root_walls.T)
     exact = partial(jnp.einsum, precision=EXACT)  # the variance is a difference of large numbers
     mean = exact("bri,i->br", features, learned.law) + exact("brn,rn->br", k, learned.weights)
     explained = jnp.sum(exact("rmn,brn->brm", learned.inverse_root, k) ** 2, -1)
     of_law = exact("bri,ij,brj->br", features, learned.law_covariance, features)
-    variance = covariance(scales, 0.0, root_walls, root_walls) - explained + of_law
+    variance = covariance(scales, 0.0, 1.0, root_walls, root_walls) - explained + of_law
     return mean, jnp.sqrt(jnp.maximum(variance, 0))
 
 
@@ -180,6 +180,6 @@ def covariance_of_powers(
     scales: Scales, readings: Readings, root_walls: Float[np.ndarray, "n r"], own: Any, r: int
 ) -> Float[np.ndarray, "m m"]:
     """Returns the covariance (dB^2) of the residuals of the mean powers of the places `own` at receiver r, with their noise."""
-    places, walls = readings.places[own], root_walls[own, r]
-    k = covariance(scales, distances(places, places), walls[:, None], walls)
+    places, walls = readings.places[own], root_walls[own]
+    k = covariance(scales, distances(places, places), in_one_room(walls, walls), walls[:, r, None], walls[:, r])
     return np.asarray(k) + np.diag(noise(scales, readings.counts[own, r]))

@@ -52,26 +52,25 @@ def alike(apart: Any) -> Any:
     return namespace(apart).exp(-apart / LENGTH)
 
 
-def covariance(scales: Scales, apart: Any, root_walls: Any, others: Any) -> Any:
+def covariance(scales: Scales, apart: Any, shared: Any, root_walls: Any, others: Any) -> Any:
     """Returns the covariance (dB^2) of residuals at one receiver.
 
     Args:
         scales: standard deviations and length.
         apart: distances between the two positions of each pair, metres.
+        shared: `in_one_room` of each pair.
         root_walls: sqrt(w) of the first position of each pair, ...
         others: ... and of the second.
     """
     near = (scales.near**2 + scales.wall**2 * root_walls * others) * alike(apart)
-    far = scales.far**2 * behind_as_many(root_walls, others) * namespace(apart).exp(-apart / scales.length_m)
-    return near + far + scales.gain**2
+    return near + scales.far**2 * shared * namespace(apart).exp(-apart / scales.length_m) + scales.gain**2
 
 
-def behind_as_many(root_walls: Any, others: Any) -> Any:
-    """Returns the correlation of far residuals by sqrt(w) of two positions: one where as many walls lie in between, otherwise
-    next to none, because rooms have shadows of their own. (Positive definite, which a comparison of rounded numbers is, too,
-    but not one with a tolerance.)"""
-    fall = 10.0
-    return namespace(root_walls).exp(-fall * namespace(root_walls).abs(root_walls - others))
+def in_one_room(root_walls: Any, others: Any) -> Any:
+    """Returns the correlation (b, n) of residuals by the walls towards all receivers, which mark a room: sqrt(w) of positions
+    (b, r) and of others (n, r). It is 1 behind as many walls, and small a wall further: rooms have shadows of their own."""
+    fall = 10.0  # anything between 3 and 30 scores alike
+    return namespace(root_walls).exp(-fall * namespace(root_walls).abs(root_walls[:, None] - others).mean(-1))
 
 
 def noise(scales: Scales, counts: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
@@ -96,7 +95,7 @@ def learn_scales(readings: Readings, root_walls: Float[np.ndarray, "n r"], left:
         own = shuffled[received[shuffled, r]][:looked_at]
         apart = distances(readings.places[own], readings.places[own])
         by_walls = alike(apart) * np.outer(root_walls[own, r], root_walls[own, r])
-        shared = behind_as_many(root_walls[own, r, None], root_walls[own, r])
+        shared = in_one_room(root_walls[own], root_walls[own])
         chosen.append((apart, by_walls, shared, 1 / readings.counts[own, r], left[own, r]))
 
     def negative_log_posterior(logs: np.ndarray) -> tuple[float, np.ndarray]:
