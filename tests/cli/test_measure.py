@@ -76,7 +76,7 @@ def test_a_real_flat_with_a_room_held_out(tmp_path, shared_data):
     for room, law in (("room_east", 5.5), ("room_south", 4.9)):
         assert found[room]["error_db"] < 4.0 < law
         np.testing.assert_allclose(found[room]["rivals_db"]["log_distance"], law, atol=0.1)
-        assert 0.86 <= found[room]["within"] <= 0.95
+        assert 0.86 <= found[room]["within"] <= 0.94
     assert "CC BY 4.0" in done.err
 
 
