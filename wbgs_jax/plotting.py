@@ -541,8 +541,11 @@ def _span(values: Float[np.ndarray, "freq ny nx"]) -> dict[str, Any]:
 
 
 def draw_power_maps(learned: PowerMap, walls: Walls, cells: Readings) -> Figure:
-    """Returns a figure with a map for every receiver at the median height of the measurements, with walls and cells."""
-    height, places = float(np.median(cells.places[:, 2])), cells.places
+    """Returns a figure with a map for every receiver at the median height of the measurements, with walls and the cells of that
+    storey."""
+    height = float(np.quantile(cells.places[:, 2], 0.5, method="nearest"))
+    storey = 1.0  # metres above or below the map of cells that are shown
+    places = cells.places[np.abs(cells.places[:, 2] - height) < storey]
     outline = np.concatenate([np.asarray(walls.ends).reshape(-1, 2), places[:, :2], cells.receivers[:, :2]])
     finest, margin = 0.1, 0.3  # pixel spacing and margin around the plan, metres
     most_pixels, most_receivers = 40_000, 12  # the spacing grows for larger plans
@@ -564,5 +567,5 @@ def draw_power_maps(learned: PowerMap, walls: Walls, cells: Readings) -> Figure:
         axis.plot(*cells.receivers[r, :2], **STAR)
     axes[0].legend(fontsize=8, loc="upper right")
     name_axes(axes, "x [m]", "y [m]")
-    figure.colorbar(image, ax=axes, shrink=0.8, label=f"mean received power [dBm]\n{height:.2g} m above the floor")
+    figure.colorbar(image, ax=axes, shrink=0.8, label=f"mean received power [dBm]\nat z = {height:.2g} m")
     return figure

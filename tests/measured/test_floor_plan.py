@@ -102,6 +102,8 @@ def test_classes_of_walls_are_read(tmp_path):
     walls = load_walls(path)
     assert walls.classes == ("concrete", "glass")
     np.testing.assert_array_equal(walls.of_class, [[0, 1], [1, 0], [0, 1]])
+    path.write_text("x1,y1,x2,y2,material\n0,0,5,0,glass\n5,0,5,3,\n")
+    np.testing.assert_array_equal(load_walls(path).of_class, [[1], [0]])
     path.write_text("x1,y1,x2,y2,type\n0,0,5,0,brick\n5,0,5,3,brick\n")
     assert load_walls(path).of_class is None
 

@@ -85,8 +85,8 @@ def test_the_covariance_is_that_of_the_formula(rng):
             distance = np.linalg.norm(a[:, None] - b, axis=-1)
             walls, others = -phi(a)[:, 2], -phi(b)[:, 2]
             near = np.exp(-distance / LENGTH) * (scales.near**2 + scales.wall**2 * np.outer(walls, others))
-            all_a, all_b = (np.sqrt(walls_between(at)) for at in (a, b))
-            room = np.exp(-10 * np.abs(all_a[:, None] - all_b).mean(-1))
+            to_all, others_to_all = (np.sqrt(walls_between(at)) for at in (a, b))
+            room = np.exp(-10 * np.abs(to_all[:, None] - others_to_all).mean(-1))
             return near + scales.far**2 * room * np.exp(-distance / scales.length_m) + scales.gain**2
 
         inverse = np.linalg.inv(k(tx[own], tx[own]) + (scales.place**2 + scales.reading**2) * np.eye(own.sum()))
@@ -146,18 +146,20 @@ def test_scales_are_found(rng):
     assert found.near < 2.5 and 1.2 < found.reading < 3, found
 
 
-def test_storeys_attenuate(rng):
-    """A quarter without readings of a building with two storeys: the map follows the law to within its noise."""
+@pytest.mark.parametrize("height", [0.3, 1.0, 1.2])
+def test_storeys_attenuate(rng, height):
+    """A quarter without readings of a building with two storeys: the map follows the law to within its noise, whether robots or
+    persons carry the transmitter, and receivers hang from the ceilings."""
     n = 240
-    tx = np.column_stack([rng.uniform(0, 20, n), rng.uniform(0, 12, n), rng.choice([1.2, 4.4], n)])
-    receivers = np.array([[x, y, z] for z in (2.5, 5.7) for x in (2.0, 18.0) for y in (2.0, 10.0)])
+    tx = np.column_stack([rng.uniform(0, 20, n), rng.uniform(0, 12, n), height + rng.choice([0, 3.2], n)])
+    receivers = np.array([[x, y, z] for z in (2.7, 5.9) for x in (2.0, 18.0) for y in (2.0, 10.0)])
     storeys = np.abs((tx[:, None, 2] > 3) - 1.0 * (receivers[:, 2] > 3))
     law = -40 - 22 * np.log10(np.linalg.norm(tx[:, None] - receivers, axis=-1)) - 18 * storeys
     cells = Readings(tx, law + rng.normal(0, 3, law.shape), np.ones_like(law), ("",) * n, receivers)
     out = (tx[:, 0] > 10) & (tx[:, 1] > 6)
     learned = learn_map(cells.without(out))
     mean, _ = received_power(learned, jnp.asarray(tx, jnp.float32))
-    np.testing.assert_allclose(learned.ceilings, [3.1], atol=0.05)
+    np.testing.assert_allclose(learned.ceilings, [3.2], atol=0.05)
     np.testing.assert_allclose(learned.law[3], 18, atol=1.5)
     assert np.abs(np.asarray(mean) - law)[out].mean() < 1.2
 
@@ -180,7 +182,7 @@ def differences(kind, tx, receivers, rng):
 
 @pytest.mark.parametrize("kind", ["gains", "shadows", "directional", "waves"])
 def test_the_map_is_no_worse_than_any_rival(kind, rng):
-    """Squares and quarters of a hall are held out; every rival is a limit of the map."""
+    """Squares and quarters of a hall are held out."""
     tx = np.column_stack([rng.uniform(0, 30, 150), rng.uniform(0, 20, 150), np.full(150, 1.3)])
     receivers = np.column_stack([rng.uniform(0, 30, 5), rng.uniform(0, 20, 5), np.full(5, 2.5)])
     law = -40 - 24 * np.log10(np.linalg.norm(tx[:, None] - receivers, axis=-1))
@@ -220,7 +222,10 @@ def test_classes_of_walls_have_losses_of_their_own(rng):
 
 def test_ceilings_lie_between_storeys():
     np.testing.assert_allclose(find_ceilings(np.array([1.3, 7.5, 4.4, 1.3])), [3.1, 6.2])
-    np.testing.assert_allclose(find_ceilings(np.array([0.5, 2.5])), [1.5])  # a person carries nothing below the middle
+    np.testing.assert_allclose(find_ceilings(np.array([0.5, 3.5])), [3.0])  # as high above the floor on both storeys
+    np.testing.assert_allclose(find_ceilings(np.array([101.0, 103.0])), [102.0])  # never below the middle
+    stairs = np.array([1.9, 2.6, 3.3, 4.0])
+    np.testing.assert_allclose(find_ceilings(np.concatenate([np.full(80, 1.3), stairs, np.full(80, 4.4)])), [3.1])
     assert not len(find_ceilings(np.array([0.4, 1.3, 2.0, 1.1])))
 
 

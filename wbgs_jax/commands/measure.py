@@ -29,7 +29,7 @@ from wbgs_jax._util.cli import parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, check_writable, write_csv, write_json
-from wbgs_jax.commands.options import PICTURES, SurveyOptions, check_suffixes
+from wbgs_jax.commands.options import PICTURES, SurveyOptions, check_effects, check_suffixes
 from wbgs_jax.data.floor_plan import extruded
 from wbgs_jax.data.rssi_folder import attribution
 from wbgs_jax.data.tables import check_positions
@@ -71,6 +71,7 @@ def check(command: Command) -> None:
         raise UserError("predicted powers need readings: give --data FOLDER")
     if command.answers and not command.tx:
         raise UserError("--answers needs --tx x,y,z")
+    check_effects(command, {"ceiling": ("--mesh",)}, ["--mesh"] * bool(command.mesh), "a map")
     command.survey_settings()
     if not 0 < command.ceiling < np.inf:
         raise UserError(f"--ceiling is {command.ceiling:g}; give metres")
@@ -111,19 +112,28 @@ def answers(learned: PowerMap, places: Float[np.ndarray, "tx 3"], where: Domain)
 
 def report(learned: PowerMap, found: list[Score], command: Command, size: float) -> dict[str, Any]:
     """Returns the content of a results file."""
-    law, scales = (np.asarray(a, float).round(4).tolist() for a in (learned.law, learned.scales))
-    names = ["dbm_at_one_metre", "exponent", "first_wall_db", "first_ceiling_db"]
-    names += [f"besides_{_key(name)}_db" for name in learned.walls.classes]
+    scales = np.asarray(learned.scales, float).round(4).tolist()
     assert command.data is not None, "checked"
     return {
         "data": command.data.resolve().name,
         "attribution": attribution(command.data),
         "cell_m": size,
-        "law": dict(zip(names, law, strict=True)),
+        "law": _law_as_json(learned),
         "scales": dict(zip((field.name for field in dataclasses.fields(Scales)), scales, strict=True)),
         "scores": {_key(score.held_out): _as_json(score) for score in found},
         "environment": environment(),
     }
+
+
+def _law_as_json(learned: PowerMap) -> dict[str, float]:
+    """Returns the parameters of the law that the data determine, by name."""
+    at_one_metre, exponent, wall, ceiling, *additional = np.asarray(learned.law, float).round(4).tolist()
+    law = {"dbm_at_one_metre": at_one_metre, "exponent": exponent}
+    if len(learned.walls.ends):
+        law["first_wall_db"] = wall
+    for name, further in zip(learned.walls.classes, additional, strict=True):
+        law[f"first_wall_db_{_key(name)}"] = round(wall + further, 4)
+    return law | ({"first_ceiling_db": ceiling} if len(learned.ceilings) else {})
 
 
 def _as_json(score: Score) -> dict[str, Any]:

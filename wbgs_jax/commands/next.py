@@ -135,6 +135,7 @@ def of_readings(command: Command, places: Float[np.ndarray, "c 3"]) -> State:
     import jax
     import jax.numpy as jnp
 
+    from wbgs_jax._util.pytree import map_blocks
     from wbgs_jax.power_map.model import learn_map, received_power
     from wbgs_jax.power_map.scales import LENGTH as ALIKE_M
     from wbgs_jax.power_map.survey import load_survey
@@ -146,9 +147,10 @@ def of_readings(command: Command, places: Float[np.ndarray, "c 3"]) -> State:
     if apart.max() > most_apart_m:
         say(f"note: candidates are up to {apart.max():.2g} m above or below all readings, whose height is z or --height")
     learned = learn_map(survey.cells, survey.walls)
-    _, std = jax.jit(received_power)(learned, jnp.asarray(places, jnp.float32))
+    predict = jax.jit(lambda block: received_power(learned, block)[1])
+    std = map_blocks(predict, jnp.asarray(places, jnp.float32), 256)
     outside = survey.domain.outside(places)
-    return State(np.asarray(survey.measured, float), np.where(outside, np.nan, np.asarray(std).mean(1)), "dB", ALIKE_M)
+    return State(np.asarray(survey.measured, float), np.where(outside, np.nan, std.mean(1)), "dB", ALIKE_M)
 
 
 def choose(command: Command) -> None:

@@ -95,10 +95,10 @@ def _classes(path: Path, header: list[str], rows: list[list[str]]) -> tuple[Floa
     if not named:
         return None, ()
     own = [row[header.index(named[0])].strip().lower() for row in rows]
-    classes, most = tuple(sorted(set(own))), 10
+    classes, most = tuple(sorted({*own} - {""})), 10  # an empty cell is no class
     if len(classes) > most:
         raise UserError(f"{path} has {len(classes)} different values in the column {named[0]!r}; at most {most} can be learned")
-    if len(classes) == 1:
+    if len(set(own)) < 2:
         return None, ()
     return np.array([[1.0 * (name == one) for one in classes] for name in own]), classes
 

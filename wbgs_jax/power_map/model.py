@@ -7,7 +7,7 @@ with d the distance to receiver r, w the number of walls and k the number of cei
 cost less than the first one, since waves through doors, around corners and along facades do not cross them: L(k) is the
 decreasing loss of further floors of the multi-wall model (COST 231, final report, section 4.7), and sqrt(w) its counterpart for
 walls; if walls have classes, l is a mean over those in between. The law is common to all receivers and fitted by least squares,
-in which the readings of one square metre count as one, so that it holds where nothing was measured. The residuals are the gain
+in which the readings of one cubic metre count as one, so that it holds where nothing was measured. The residuals are the gain
 g of a receiver, u, due to rooms and furniture, and v, due to individual walls. A part of u decays within a metre, as v does,
 another one over rooms (exponential covariances; Rasmussen and Williams 2006, chapter 2). Its length and all shares follow from
 the data (`scales.learn_scales`).
@@ -19,7 +19,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from scipy.linalg import cho_solve, solve_triangular
 
 from wbgs_jax._util.errors import UserError
@@ -34,7 +34,7 @@ LAW = np.array([-45.0, 2.0, 6.0, 15.0])
 LAW_WIDTH = np.array([30.0, 1.0, 4.0, 8.0])
 """... and their prior standard deviations."""
 CLASS_WIDTH = 4.0
-"""Prior standard deviation of what walls of a class lose besides, dB."""
+"""Prior standard deviation of the additional loss of walls of a class, dB."""
 APART = 5.0
 """Standard deviation of the error of the law where readings within a metre count as one, dB."""
 NEAREST = 0.1
@@ -55,13 +55,13 @@ class PowerMap:
     """Heights of the ceilings between storeys, metres."""
     places: Float[Array, "n 3"]
     law: Float[Array, " k"]
-    """Power at one metre (dBm), exponent, loss of the first wall and of the first ceiling (dB), and what the first wall of each
-    class loses besides (dB)."""
+    """Power at one metre (dBm), exponent, loss of the first wall and of the first ceiling (dB), and the additional loss of the
+    first wall of each class (dB)."""
     law_covariance: Float[Array, "k k"]
     scales: Float[Array, "7"]
     """The values of `Scales`, in order."""
-    root_walls: Float[Array, "n r"]
-    """sqrt(w) of the positions."""
+    crossed: Float[Array, "n r 2"]
+    """sqrt(w) and L(k) of the links from the positions."""
     weights: Float[Array, "r n"]
     """(K + noise)^-1 (powers - law)."""
     inverse_root: Float[Array, "r n n"]
@@ -90,18 +90,18 @@ def learn_map(readings: Readings, walls: Walls = NO_WALLS, scales: Scales | None
     ceilings = find_ceilings(readings.places[:, 2])
     features = law_features(readings.places, readings.receivers, walls, ceilings)
     law, law_covariance = fit_law(readings, features)
-    root_walls, left = -features[..., 2], np.where(received, readings.powers - features @ law, 0)
+    crossed, left = -features[..., 2:4], np.where(received, readings.powers - features @ law, 0)
     if scales is None:
-        scales = learn_scales(readings, root_walls, left)
-    n = len(readings.places)
+        scales = learn_scales(readings, crossed, left)
+    n, shared = len(readings.places), in_one_room(crossed, crossed)
     weights, roots = np.zeros((len(readings.receivers), n)), np.zeros((len(readings.receivers), n, n))
     for r in range(len(readings.receivers)):
         own = np.flatnonzero(received[:, r])
-        factor = np.linalg.cholesky(covariance_of_powers(scales, readings, root_walls, own, r))
+        factor = np.linalg.cholesky(covariance_of_powers(scales, readings, crossed, shared, own, r))
         weights[r, own] = cho_solve((factor, True), left[own, r])
         roots[r][np.ix_(own, own)] = solve_triangular(factor, np.eye(len(own)), lower=True)
     numbers = np.array([*vars(scales).values()])
-    arrays = ceilings, readings.places, law, law_covariance, numbers, root_walls, weights, roots
+    arrays = ceilings, readings.places, law, law_covariance, numbers, crossed, weights, roots
     return PowerMap(*jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), (readings.receivers, walls, *arrays)))
 
 
@@ -117,28 +117,38 @@ def received_power(learned: PowerMap, tx_position: Float[Array, "b 3"]) -> tuple
         Mean (b, r), dBm, and standard deviation (b, r), dB.
     """
     features = law_features(tx_position, learned.receivers, learned.walls, learned.ceilings)
-    scales, root_walls = Scales(*learned.scales), -features[..., 2]
-    apart, shared = distances(tx_position, learned.places), in_one_room(root_walls, learned.root_walls)
-    k = covariance(scales, apart[:, None], shared[:, None], root_walls[..., None], learned.root_walls.T)
+    scales, crossed = Scales(*learned.scales), -features[..., 2:4]
+    root_walls = crossed[..., 0]
+    apart, shared = distances(tx_position, learned.places), in_one_room(crossed, learned.crossed)
+    k = covariance(scales, apart[:, None], shared[:, None], root_walls[..., None], learned.crossed[..., 0].T)
     exact = partial(jnp.einsum, precision=EXACT)  # the variance is a difference of large numbers
     mean = exact("bri,i->br", features, learned.law) + exact("brn,rn->br", k, learned.weights)
     explained = jnp.sum(exact("rmn,brn->brm", learned.inverse_root, k) ** 2, -1)
     of_law = exact("bri,ij,brj->br", features, learned.law_covariance, features)
     variance = covariance(scales, 0.0, 1.0, root_walls, root_walls) - explained + of_law
-    return mean, jnp.sqrt(jnp.maximum(variance, 0))
+    least = 1e-6  # dB^2: with a finite gradient where rounding leaves nothing
+    return mean, jnp.sqrt(jnp.maximum(variance, least))
 
 
 def find_ceilings(heights: Float[np.ndarray, " n"]) -> Float[np.ndarray, " c"]:
     """Returns the heights of the ceilings between transmitters of several storeys, metres: below each storey's lowest
-    transmitter by the height at which a person carries it, but not below the middle to the storey underneath."""
-    carried, storey = 1.3, 1.8  # metres: height above the floor, and the smallest step of heights between storeys
-    levels = np.unique(heights)
+    transmitter by the height above the floor at which it is carried, but not below the middle to the storey underneath. That
+    height is the one of the lowest transmitter above z = 0, if it is at most 1.3 m, and 1.3 m otherwise. A few transmitters
+    between storeys, on stairs, do not count."""
+    storey, usual = 1.8, 1.3  # metres: smallest step of heights between storeys, and height at which people carry transmitters
+    around, few = 0.3, 0.02  # metres, and the least fraction of transmitters within these of a level
+    ordered = np.sort(heights)
+    near = np.searchsorted(ordered, ordered + around, "right") - np.searchsorted(ordered, ordered - around)
+    levels = np.unique(ordered[near >= few * len(ordered)])
+    if not len(levels):
+        return levels
+    carried = levels[0] if 0 < levels[0] < usual else usual
     below, above = levels[:-1], levels[1:]
     return np.maximum(above - carried, (below + above) / 2)[above - below > storey]
 
 
 def law_features(tx: Any, receivers: Any, walls: Walls, ceilings: Any) -> Any:
-    """Returns the factors (b, r, 4 + c) of the law's parameters: the four of all walls, and the further loss of each class."""
+    """Returns the factors (b, r, 4 + c) of the law's parameters: four of all walls, and the additional loss of each class."""
     xp = namespace(tx)
     distance = xp.maximum(distances(tx, receivers), NEAREST)
     each = crossed(walls, tx[:, None, :2], receivers[None, :, :2])
@@ -151,9 +161,8 @@ def law_features(tx: Any, receivers: Any, walls: Walls, ceilings: Any) -> Any:
     law = xp.stack([xp.ones_like(distance), -10 * xp.log10(distance), -root, -further], -1)
     if walls.of_class is None:
         return law
-    of_class = (
-        -(each @ walls.of_class) / xp.where(between > 0, root, 1.0)[..., None]
-    )  # -sqrt(w) times the fraction of the class
+    # -sqrt(w) times the fraction of the class.
+    of_class = -(each @ walls.of_class) / xp.where(between > 0, root, 1.0)[..., None]
     return xp.concatenate([law, of_class], -1)
 
 
@@ -177,9 +186,14 @@ def fit_law(
 
 
 def covariance_of_powers(
-    scales: Scales, readings: Readings, root_walls: Float[np.ndarray, "n r"], own: Any, r: int
+    scales: Scales,
+    readings: Readings,
+    crossed: Float[np.ndarray, "n r 2"],
+    shared: Float[np.ndarray, "n n"],
+    own: Int[np.ndarray, " m"],
+    r: int,
 ) -> Float[np.ndarray, "m m"]:
     """Returns the covariance (dB^2) of the residuals of the mean powers of the places `own` at receiver r, with their noise."""
-    places, walls = readings.places[own], root_walls[own]
-    k = covariance(scales, distances(places, places), in_one_room(walls, walls), walls[:, r, None], walls[:, r])
+    places, walls = readings.places[own], crossed[own, r, 0]
+    k = covariance(scales, distances(places, places), shared[np.ix_(own, own)], walls[:, None], walls)
     return np.asarray(k) + np.diag(noise(scales, readings.counts[own, r]))

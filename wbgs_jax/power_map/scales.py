@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
+from scipy.spatial.distance import cdist
 
 from wbgs_jax.data.floor_plan import namespace
 from wbgs_jax.data.rssi_folder import Readings
@@ -66,11 +67,21 @@ def covariance(scales: Scales, apart: Any, shared: Any, root_walls: Any, others:
     return near + scales.far**2 * shared * namespace(apart).exp(-apart / scales.length_m) + scales.gain**2
 
 
-def in_one_room(root_walls: Any, others: Any) -> Any:
-    """Returns the correlation (b, n) of residuals by the walls towards all receivers, which mark a room: sqrt(w) of positions
-    (b, r) and of others (n, r). It is 1 behind as many walls, and small a wall further: rooms have shadows of their own."""
+def in_one_room(crossed: Any, others: Any) -> Any:
+    """Returns the correlation (b, n) of residuals by what is crossed towards all receivers, which marks a room, because rooms
+    have shadows of their own: the smaller, the more the numbers of walls and ceilings differ, in the mean over receivers.
+
+    Args:
+        crossed: sqrt(w) and L(k) of the links from positions to all receivers (b, r, 2), ...
+        others: ... and from others (n, r, 2).
+    """
     fall = 10.0  # anything between 3 and 30 scores alike
-    return namespace(root_walls).exp(-fall * namespace(root_walls).abs(root_walls[:, None] - others).mean(-1))
+    first, second = (marks.reshape(len(marks), -1) for marks in (crossed, others))
+    if namespace(crossed) is np:
+        differences = cdist(first, second, "cityblock")
+    else:
+        differences = abs(first[:, None] - second).sum(-1)
+    return namespace(crossed).exp(-fall * differences / crossed.shape[1])
 
 
 def noise(scales: Scales, counts: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
@@ -78,12 +89,12 @@ def noise(scales: Scales, counts: Float[np.ndarray, "*n"]) -> Float[np.ndarray, 
     return float(scales.place) ** 2 + float(scales.reading) ** 2 / counts
 
 
-def learn_scales(readings: Readings, root_walls: Float[np.ndarray, "n r"], left: Float[np.ndarray, "n r"]) -> Scales:
+def learn_scales(readings: Readings, crossed: Float[np.ndarray, "n r 2"], left: Float[np.ndarray, "n r"]) -> Scales:
     """Returns the scales of maximum posterior probability, with the values of `Scales` as prior medians.
 
     Args:
         readings: positions and numbers of readings.
-        root_walls: sqrt(w) of every link.
+        crossed: sqrt(w) and L(k) of every link.
         left: residuals of the law, dB.
     """
     first, widths = np.log([*vars(Scales()).values()]), np.array([*vars(WIDTHS).values()])
@@ -94,8 +105,8 @@ def learn_scales(readings: Readings, root_walls: Float[np.ndarray, "n r"], left:
     for r in np.flatnonzero(received.any(0)):
         own = shuffled[received[shuffled, r]][:looked_at]
         apart = distances(readings.places[own], readings.places[own])
-        by_walls = alike(apart) * np.outer(root_walls[own, r], root_walls[own, r])
-        shared = in_one_room(root_walls[own], root_walls[own])
+        by_walls = alike(apart) * np.outer(crossed[own, r, 0], crossed[own, r, 0])
+        shared = in_one_room(crossed[own], crossed[own])
         chosen.append((apart, by_walls, shared, 1 / readings.counts[own, r], left[own, r]))
 
     def negative_log_posterior(logs: np.ndarray) -> tuple[float, np.ndarray]:

@@ -20,6 +20,8 @@ CELL_M = 0.25
 """Side of the cells over which readings are averaged."""
 STOREY_M = 1.0
 """Maximum height of enlarged cells: higher ones average storeys, metres."""
+ONE_STOREY_M = 2.5
+"""Largest difference of heights of readings, or of readings and a receiver, within one storey, metres."""
 BEYOND_M = 2.0
 """Distance (metres) from readings, receivers and walls up to which predictions have an interval: it includes the next room, not
 the next building."""
@@ -113,12 +115,19 @@ def _note_storeys(folder: Path, cells: Readings) -> None:
             f"{folder}: readings lie on {len(ceilings) + 1} storeys; ceilings at z = {listed} m attenuate in the map",
             stacklevel=3,
         )
-    one_storey = 2.5  # metres: largest height of a receiver above or below readings of its storey
-    away = np.maximum(cells.receivers[:, 2] - heights.max(), heights.min() - cells.receivers[:, 2])
-    if away.max() > one_storey:
+    of_storey = np.sum(heights[:, None] > ceilings, -1)
+    high = max(float(np.ptp(heights[of_storey == one])) for one in np.unique(of_storey))
+    if high > ONE_STOREY_M:
         warnings.warn(
-            f"{folder}: receiver {away.argmax() + 1} is {away.max():.2g} m above or below all readings; a ceiling in between "
-            "counts as part of its gain",
+            f"{folder}: heights z of readings range over {high:.2g} m without a gap, and no ceiling attenuates among them; "
+            "leave out readings between storeys",
+            stacklevel=3,
+        )
+    away = np.maximum(cells.receivers[:, 2] - heights.max(), heights.min() - cells.receivers[:, 2])
+    if away.max() > ONE_STOREY_M:
+        warnings.warn(
+            f"{folder}: receiver {away.argmax() + 1} is {away.max():.2g} m above or below all readings; the loss of a ceiling "
+            "in between is not known, and corrected only near the readings",
             stacklevel=3,
         )
 

@@ -1,5 +1,5 @@
-"""Validation of a map on held-out measurements: whole rooms and squares of one metre, compared with baselines, most of which
-ignore walls.
+"""Validation of a map on held-out measurements: whole rooms and squares of one metre, compared with baselines, which ignore
+walls.
 
 A floor plan has controls: the same plan turned and mirrored about its middle, and none. Only if its map is better than all of
 them has it been shown that the plan itself helps, and not merely some walls.
@@ -21,7 +21,7 @@ from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.data.floor_plan import NO_WALLS, Walls, crossings
 from wbgs_jax.data.rssi_folder import Readings
 from wbgs_jax.power_map.model import APART, MIN_POWERS, NEAREST, covariance_of_powers, find_ceilings, fit_law, law_features
-from wbgs_jax.power_map.scales import Scales, alike, distances, learn_scales, noise
+from wbgs_jax.power_map.scales import Scales, alike, distances, in_one_room, learn_scales, noise
 
 BLOCK, FOLDS = 1.0, 40
 """Side of the held-out squares, metres; and the maximum number of folds, into which several squares are combined."""
@@ -158,15 +158,16 @@ def _mapped(parts: Parts, cells: Readings, walls: Walls) -> tuple[Float[np.ndarr
     and Williams 2006, section 5.4.2, for single values).
     """
     features = law_features(cells.places, cells.receivers, walls, find_ceilings(cells.places[:, 2]))
-    root_walls, received = -features[..., 2], np.isfinite(cells.powers)
+    crossed, received = -features[..., 2:4], np.isfinite(cells.powers)
+    shared = in_one_room(crossed, crossed)
     largest = cells.without(max(parts, key=np.sum))
     law, _ = fit_law(largest, features)
-    scales = learn_scales(largest, root_walls, np.where(np.isfinite(largest.powers), largest.powers - features @ law, 0))
+    scales = learn_scales(largest, crossed, np.where(np.isfinite(largest.powers), largest.powers - features @ law, 0))
     laws = [fit_law(cells.without(part), features) for part in parts]
     mean, variance = (np.full(cells.powers.shape, np.nan) for _ in range(2))
     for r, mask in enumerate(received.T):
         own = np.flatnonzero(mask)
-        inverse = np.linalg.inv(covariance_of_powers(scales, cells, root_walls, own, r))
+        inverse = np.linalg.inv(covariance_of_powers(scales, cells, crossed, shared, own, r))
         for part, (law, law_covariance) in zip(parts, laws, strict=True):
             out = part[own]
             if out.any():
