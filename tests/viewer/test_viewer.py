@@ -4,6 +4,7 @@ import base64
 import dataclasses
 import io
 import re
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -69,6 +70,38 @@ def test_the_nearest_sample_is_the_datas(coherent):
     sample = coherent.nearest_sample(data.tx_positions[link] + 1e-4, data.frequencies_hz[link])
     np.testing.assert_array_equal(sample.pas, np.asarray(data.pas(np.array([link])))[0])
     assert sample.part == "test" and sample.distance_m < 1e-3 and -1 <= sample.ssim <= 1
+
+
+def test_a_late_sample_is_not_one_of_changed_materials(coherent, monkeypatch):
+    """Another thread changes a material while a sample is computed: the next question computes it anew."""
+    one, asked = Session(coherent.loaded), []
+    compute = one._sample
+
+    def slowly(link):
+        asked.append(one.version)
+        if len(asked) == 1:
+            one._changed()
+        return compute(link)
+
+    monkeypatch.setattr(one, "_sample", slowly)
+    for _ in range(3):
+        one.nearest_sample(PLACE, HZ)
+    assert len(asked) == 2 and asked[1] == asked[0] + 1
+
+
+def test_changed_materials_have_no_interval(coherent):
+    one = Session(coherent.loaded)
+    assert not one.altered and not one.predict(PLACE, HZ).warnings
+    one.change_material(0, 3.0, 1e-3)
+    answer = one.predict(PLACE, HZ)
+    assert answer.expected is None and answer.within_db is None and "materials are not as trained" in answer.warnings[-1]
+    one.restore()
+    assert not one.altered and not one.predict(PLACE, HZ).warnings
+
+
+def test_typed_numbers_stay_within_the_limits_of_their_control():
+    for typed, used in ((0, 0.05), (0.3, 0.3), (9, 2.0)):
+        assert panel.number(SimpleNamespace(value=typed, min=0.05, max=2.0)) == used
 
 
 def test_a_sample_is_compared_with_what_would_be_observed(coherent, monkeypatch):

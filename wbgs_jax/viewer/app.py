@@ -104,9 +104,13 @@ class Viewer:
         self._clicked: tuple[float, float] | None = None
         self._receiver = session.receiver
         self._way, self._walked, self._syncing = walk.stops(data.tx_positions), 0.0, threading.local()
+        # Actions of controls run in threads of their own: the last change of the session is that of the newest value, ...
+        self._changing = threading.Lock()
+        # ... and the newest map is the one that is drawn.
+        self._drawing, self._beside_due = threading.RLock(), 0.0
         self._look_in()
         self._spectrum = Latest(self._show, self._show_error)
-        self._map = Latest(self._draw_map, self._show_error)
+        self._map = Latest(self._draw_map, self._show_map_error)
         self._connect()
         threading.Thread(target=self._walk, daemon=True).start()
         self.page.progress("compiling the field", 60)
@@ -125,13 +129,13 @@ class Viewer:
     @property
     def frequency_hz(self) -> float:
         """The queried frequency, hertz."""
-        return 1e9 * float(self.controls.ghz.value)
+        return 1e9 * panel.number(self.controls.ghz)
 
     @property
     def map_conditions(self) -> tuple[Any, ...]:
         """Everything that a map depends on."""
         m, where = self.controls.map, np.asarray(self.session.receiver.position).tolist()
-        return self.frequency_hz, float(m.height.value), float(m.step.value), *where, self.session.version
+        return self.frequency_hz, panel.number(m.height), panel.number(m.step), *where, self.session.version
 
     def draw_map(self) -> None:
         """Draws the received power over the plane of the controls, and returns when it is drawn."""
@@ -250,7 +254,8 @@ class Viewer:
         if wanted is self.session.receiver:
             return
         try:
-            self.session.use_receiver(wanted)
+            with self._changing:
+                self.session.use_receiver(wanted)
         except Exception:
             self._receiver = self.session.receiver
             raise
@@ -275,8 +280,10 @@ class Viewer:
                 self._draw_gaussians(str(c.gaussians.value))
         self.page.ready()
         self.updates += 1
-        if not self._spectrum.waiting:
+        least_often_s = 0.5  # the rest is drawn at least so often, even while the transmitter moves on
+        if not self._spectrum.waiting or time.monotonic() > self._beside_due:
             self._show_beside(position, frequency)
+            self._beside_due = time.monotonic() + least_often_s
 
     @contextlib.contextmanager
     def _notice(self) -> Iterator[None]:
@@ -295,7 +302,7 @@ class Viewer:
         """Draws what may lag behind while the transmitter moves."""
         assert self.answer is not None, "the prediction is drawn first"
         c, d = self.controls, self.display
-        d.channel.content = panel.channel_figures(self.answer.paths, c.budget, float(c.band.value))
+        d.channel.content = panel.channel_figures(self.answer.paths, c.budget, panel.number(c.band))
         d.truth.content = panel.truth_figure(self.session.nearest_sample(position, frequency_hz))
         if self.map is not None:
             self._show_map()
@@ -303,9 +310,14 @@ class Viewer:
                 self._map.request()
 
     def _show_error(self, words: str) -> None:
-        say(f"viewer: {words}")
-        self.display.summary.content = as_words(words, "wbgs-warning")
+        shown = f"{words} What is drawn is an earlier prediction." if self.answer is not None else words
+        self.display.summary.content = as_words(shown, "wbgs-warning")
         self.page.ready()
+        say(f"viewer: {words}")
+
+    def _show_map_error(self, words: str) -> None:
+        self.controls.map.caption.content = as_words(words, "wbgs-warning")
+        say(f"viewer: {words}")
 
     def _draw_paths(self) -> None:
         c, paths = self.controls, self.answer.paths if self.answer else None
@@ -320,19 +332,20 @@ class Viewer:
 
     def _choose(self, number: int) -> None:
         self.chosen = number
-        self._draw_paths()
+        self._spectrum.request()  # in one thread with all other drawing of paths
 
     def _draw_map(self) -> None:
         """Computes and draws the map, unless it is drawn already."""
         m, (low, high) = self.controls.map, self.view.box
         if not m.shown.value:
-            self.map = self._clicked = None
-            self.view.remove_map()
-            m.picture.content = m.caption.content = ""
+            with self._drawing:
+                self.map = self._clicked = None
+                self.view.remove_map()
+                m.picture.content = m.caption.content = ""
             return
         conditions, frequency = self.map_conditions, self.frequency_hz
         if self.map is None or self.map.conditions != conditions:
-            plane = plane_over(low[:2], high[:2], float(m.height.value), float(m.step.value))
+            plane = plane_over(low[:2], high[:2], panel.number(m.height), panel.number(m.step))
             self._show_map(0.0)
 
             def progress(share: float) -> None:
@@ -347,9 +360,15 @@ class Viewer:
                 return
             self.map, self._clicked = DrawnMap(values, plane, conditions, frequency), None
         self._show_map()
+        if self.map.conditions != self.map_conditions:
+            self._map.request()
 
     def _show_map(self, share: float | None = None) -> None:
         """Draws the map that there is; `share` is the completed fraction of a newer one."""
+        with self._drawing:
+            self._redraw_map(share)
+
+    def _redraw_map(self, share: float | None) -> None:
         self._show_caption(share)
         drawn = self.map
         if drawn is None:
@@ -399,15 +418,18 @@ class Viewer:
         self._quietly(m.thickness, round(1e3 * float(found[1].thickness[m.number]), 1))
 
     def _change_material(self, m: panel.MaterialControls) -> None:
-        self.session.change_material(m.number, float(m.permittivity.value), 10 ** float(m.conductivity.value))
+        with self._changing:
+            self.session.change_material(m.number, panel.number(m.permittivity), 10 ** panel.number(m.conductivity))
         self._spectrum.request()
 
     def _change_thickness(self, m: panel.MaterialControls) -> None:
-        self.session.change_thickness(m.number, 1e-3 * float(m.thickness.value))
+        with self._changing:
+            self.session.change_thickness(m.number, 1e-3 * panel.number(m.thickness))
         self._spectrum.request()
 
     def _as_trained(self, m: panel.MaterialControls) -> None:
-        self.session.restore()
+        with self._changing:
+            self.session.restore()
         self._show_material(m)
         self._spectrum.request()
 

@@ -110,7 +110,7 @@ def power_map(
         _axes(box, x, y),
         _color_bar(box, power, "map"),
     ]
-    return _figure(parts, box, _data(box, x, y, "({x}, {y}) m: {v} " + _unit(power), (2, 2, 1)) | _range(power))
+    return _figure(parts, box, _data(box, x, y, "({x}, {y}) m: {v}", (2, 2, 1)) | _range(power) | {"unit": " " + _unit(power)})
 
 
 def curve(x_values: Float[np.ndarray, " n"], y_values: Float[np.ndarray, " n"], x: Axis, y: Axis, digits: int = 1) -> str:

@@ -50,7 +50,10 @@
     const at = 4 * (Math.floor(b * rows) * columns + Math.floor(a * columns));
     const digits = JSON.parse(svg.dataset.digits);
     const x = between(JSON.parse(svg.dataset.x), a), y = between(JSON.parse(svg.dataset.y), 1 - b);
-    const value = data[at + 3] === 0 ? "nothing received" : between(JSON.parse(svg.dataset.v), data[at] / 255).toFixed(digits[2]);
+    // Levels at the ends stand for all values beyond the scale, if that is not the range of all values.
+    const level = data[at], beyond = svg.dataset.unit ? ({ 0: "≤ ", 255: "≥ " }[level] ?? "") : "";
+    const number = between(JSON.parse(svg.dataset.v), level / 255).toFixed(digits[2]);
+    const value = data[at + 3] === 0 ? "nothing received" : beyond + number + (svg.dataset.unit ?? "");
     return svg.dataset.read.replace("{x}", x.toFixed(digits[0])).replace("{y}", y.toFixed(digits[1])).replace("{v}", value);
   }
 
@@ -63,7 +66,7 @@
     return best;
   }
 
-  document.addEventListener("pointermove", async (event) => {
+  async function readUnder(event) {
     const svg = event.target.closest?.("svg.wbgs");
     for (const other of document.querySelectorAll("svg.wbgs")) {
       if (other === svg) continue;
@@ -82,7 +85,16 @@
       spot.setAttribute("visibility", point ? "visible" : "hidden");
       if (point) { spot.setAttribute("cx", point[0]); spot.setAttribute("cy", point[1]); }
     }
-  });
+    const most = svg.viewBox.baseVal.width - Number(read.getAttribute("x")) - 2;
+    read.removeAttribute("textLength");
+    if (read.textContent && read.getComputedTextLength() > most) {
+      read.setAttribute("textLength", most);
+      read.setAttribute("lengthAdjust", "spacingAndGlyphs");
+    }
+  }
+
+  // A tap on a phone is no movement.
+  for (const kind of ["pointermove", "pointerdown"]) document.addEventListener(kind, readUnder);
 
   // viser freezes the panel while there is no connection.
   setInterval(() => {

@@ -122,7 +122,7 @@ def make_panel(
         dbm = gui.add_vector2(
             "TX, noise [dBm]",
             (transmitter_dbm, noise_dbm),
-            step=1.0,
+            step=0.1,
             disabled=off,
             hint="Transmitted power, and noise floor of the receiver",
         )
@@ -147,6 +147,11 @@ def make_panel(
     radio = receiver, position, ghz, samples, dbm, band
     controls = Controls(*radio, paths, by_power, map_controls, cut, gaussians, play, speed, save, material)
     return controls, Display(summary, spectrum, truth, channel, path_table, gaussian_scale)
+
+
+def number(control: Any) -> float:
+    """Returns the value of a control within its limits, which a browser enforces only when typing ends."""
+    return float(np.clip(control.value, control.min, control.max))
 
 
 def receiver_names(session: Session) -> tuple[str, ...]:

@@ -122,12 +122,14 @@ class Session:
 
     def __init__(self, loaded: LoadedField):
         self.dataset, self._whole = loaded.dataset, loaded.trained
-        self._samples: dict[int, Sample] = {}
+        self._samples: dict[tuple[int, int], Sample] = {}
         self.version = 0
         """Number of changes of receiver and materials."""
         self._use(loaded)
 
     def _use(self, loaded: LoadedField) -> None:
+        self.altered = False
+        """Whether materials are not as trained, so that no interval applies."""
         self.loaded, self.trained, self.receiver, self.plan = loaded, loaded.trained, loaded.receiver, loaded.plan
         learned = self.trained.correction, self.trained.intervals
         self._neighbours, self._confidence = (for_receiver(one, self.receiver) for one in learned)
@@ -135,7 +137,6 @@ class Session:
         self._changed()
 
     def _changed(self) -> None:
-        self._samples.clear()
         self.version += 1
 
     def use_receiver(self, receiver: Receiver) -> None:
@@ -183,7 +184,7 @@ class Session:
         pas, power, within, expected, paths = jax.tree.map(np.asarray, found)
         place, hertz, domain = np.asarray(position, np.float64)[None], np.array([frequency_hz]), self.loaded.domain
         outside = bool(domain.outside(place)[0])
-        valid = not (outside or domain.out_of_band(hertz)[0])
+        valid = not (outside or self.altered or domain.out_of_band(hertz)[0])
         sure = valid and expected is not None and np.isfinite(expected[0])
         received = power is not None and self.has_power and power > NO_PATH_DB
         return Answer(
@@ -195,7 +196,10 @@ class Session:
             level=None if learned[1] is None else float(learned[1].level),
             paths=None if paths is None else self._listed(*paths),
             outside=outside,
-            warnings=tuple(domain.warnings(np.asarray(self.receiver.position), place, hertz)),
+            warnings=(
+                *domain.warnings(np.asarray(self.receiver.position), place, hertz),
+                *["materials are not as trained, so that no interval is known"] * self.altered,
+            ),
         )
 
     def _query(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> Query:
@@ -210,9 +214,14 @@ class Session:
         octaves = np.abs(np.log2(data.frequencies_hz[index] / frequency_hz))
         nearest = away <= away.min() + 1e-6
         link = int(index[nearest][np.argmin(octaves[nearest])])
-        if link not in self._samples:
-            self._samples[link] = self._sample(link)
-        return dataclasses.replace(self._samples[link], distance_m=float(away.min()))
+        key, most = (link, self.version), 256  # the version is read first: a late sample of a former one is not of this one
+        sample = self._samples.get(key)
+        if sample is None:
+            sample = self._sample(link)
+            if len(self._samples) >= most:
+                self._samples.clear()
+            self._samples[key] = sample
+        return dataclasses.replace(sample, distance_m=float(away.min()))
 
     def gaussians(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> GaussianState | None:
         """Returns the Gaussians with attenuation and signal (NumPy); None if the field has none."""
@@ -250,7 +259,7 @@ class Session:
         found = self._calibratable()
         own = found.field.with_material(found.of(self.trained.params), number, permittivity, conductivity)
         params = found.put(self.trained.params, own)
-        self.trained = dataclasses.replace(self.trained, params=params)
+        self.trained, self.altered = dataclasses.replace(self.trained, params=params), True
         self._changed()
 
     def change_thickness(self, number: int, metres: float) -> None:
@@ -258,7 +267,7 @@ class Session:
         found = self._calibratable()
         own, planned = found.field.with_thickness(found.of(self.plan), number, metres)
         field, self.plan = found.put(self.trained.field, own), found.put(self.plan, planned)
-        self.trained = dataclasses.replace(self.trained, field=field)
+        self.trained, self.altered = dataclasses.replace(self.trained, field=field), True
         self._changed()
 
     def _calibratable(self) -> Ability[Calibratable]:
@@ -268,7 +277,7 @@ class Session:
 
     def restore(self) -> None:
         """Uses the materials as trained for later queries."""
-        self.trained, self.plan = self.loaded.trained, self.loaded.plan
+        self.trained, self.plan, self.altered = self.loaded.trained, self.loaded.plan, False
         self._changed()
 
     def _links_with_spectra(self) -> Int[np.ndarray, " n"]:
