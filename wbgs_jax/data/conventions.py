@@ -71,8 +71,7 @@ def find_convention(
     """
     if found := _by_the_zenith(images):
         return found
-    towards = jnp.asarray(tx_positions - np.asarray(receiver.position, np.float64))
-    local = np.asarray(to_local(towards, receiver.orientation))
+    local = _seen_from(receiver, receiver.orientation, tx_positions)
     above = (local[:, 2] > 0) & (np.linalg.norm(local, axis=1) > 0)
     if not above.any():
         return Evidence(None, "no transmitter is above the receiver's horizon")
@@ -105,10 +104,9 @@ def turned(
         tx_index: index of the transmitter.
         convention: of the images.
     """
-    towards = jnp.asarray(tx_positions - np.asarray(receiver.position, np.float64))
 
     def brightness(orientation: Float[Array, "4"]) -> Float[np.ndarray, " t"]:
-        local = np.asarray(to_local(towards, orientation))
+        local = _seen_from(receiver, orientation, tx_positions)
         rank = _brighter(images, *_pixel(local, convention))
         return by_transmitter(np.where(local[:, 2] > 0, rank, 0.5), tx_index)  # nothing is known below the horizon
 
@@ -137,8 +135,7 @@ def unrelated(
         convention: of the images.
     """
     fewest, most, draws, better = 24, 200, 20, 0.9  # transmitters, random orders of them, and share of these that is exceeded
-    towards = jnp.asarray(tx_positions - np.asarray(receiver.position, np.float64))
-    local = np.asarray(to_local(towards, receiver.orientation))
+    local = _seen_from(receiver, receiver.orientation, tx_positions)
     chosen = np.unique(tx_index, return_index=True)[1]
     chosen = chosen[local[chosen, 2] > 0]
     directions = local[chosen] / np.linalg.norm(local[chosen], axis=1, keepdims=True)
@@ -156,6 +153,14 @@ def contradiction(images: UInt8[np.ndarray, "n 90 360"], convention: ConventionN
     """Returns why spectra show another convention than the named one; empty if they do not."""
     found = _by_the_zenith(images)
     return "" if found is None or found.convention == convention else found.reason
+
+
+def _seen_from(
+    receiver: Receiver, orientation: Float[Array, "4"], tx_positions: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Returns transmitters relative to a receiver (metres), in the frame of an orientation."""
+    towards = jnp.asarray(tx_positions - np.asarray(receiver.position, np.float64))
+    return np.asarray(to_local(towards, orientation))
 
 
 def _significant(gain: Float[np.ndarray, " t"]) -> bool:

@@ -23,6 +23,7 @@ from wbgs_jax._util.files import atomic_write
 from wbgs_jax.interchange.matlab import read_mat_or_npz
 from wbgs_jax.propagation.paths import InteractionType, is_vertex
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
+from wbgs_jax.radio.channel import free_space_db
 from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ
 
 NONE, SPECULAR, DIFFUSE = (kind.sionna for kind in (InteractionType.NONE, InteractionType.REFLECTED, InteractionType.SCATTERED))
@@ -471,8 +472,7 @@ def _note_gains(paths: RayPaths, name: str, direct: Bool[np.ndarray, "r t k"]) -
     fewest, usual_db, factor_db, alike_db = 5, (-40.0, 25.0), 3.0, 0.5
     if received.sum() < fewest:
         return
-    free_space = SPEED_OF_LIGHT / (4 * np.pi * paths.frequency_hz * length[received])
-    gains = 20 * np.log10(amplitude[received] / free_space)
+    gains = 20 * np.log10(amplitude[received]) - np.asarray(free_space_db(length[received], paths.frequency_hz))
     middle = float(np.median(gains))
     alike = np.abs(gains - middle).max() < alike_db
     if not usual_db[0] < middle < usual_db[1] or (alike and abs(middle) > factor_db):

@@ -90,14 +90,15 @@ def learn_map(readings: Readings, walls: Walls = NO_WALLS, scales: Scales | None
     ceilings = find_ceilings(readings.places[:, 2])
     features = law_features(readings.places, readings.receivers, walls, ceilings)
     law, law_covariance = fit_law(readings, features)
-    crossed, left = -features[..., 2:4], np.where(received, readings.powers - features @ law, 0)
+    crossed, left = -features[..., 2:4], residuals(readings, features, law)
+    root_walls, shared = crossed[..., 0], in_one_room(crossed, crossed)
     if scales is None:
-        scales = learn_scales(readings, crossed, left)
-    n, shared = len(readings.places), in_one_room(crossed, crossed)
+        scales = learn_scales(readings, root_walls, shared, left)
+    n = len(readings.places)
     weights, roots = np.zeros((len(readings.receivers), n)), np.zeros((len(readings.receivers), n, n))
     for r in range(len(readings.receivers)):
         own = np.flatnonzero(received[:, r])
-        factor = np.linalg.cholesky(covariance_of_powers(scales, readings, crossed, shared, own, r))
+        factor = np.linalg.cholesky(covariance_of_powers(scales, readings, root_walls, shared, own, r))
         weights[r, own] = cho_solve((factor, True), left[own, r])
         roots[r][np.ix_(own, own)] = solve_triangular(factor, np.eye(len(own)), lower=True)
     numbers = np.array([*vars(scales).values()])
@@ -147,6 +148,11 @@ def find_ceilings(heights: Float[np.ndarray, " n"]) -> Float[np.ndarray, " c"]:
     return np.maximum(above - carried, (below + above) / 2)[above - below > storey]
 
 
+def storeys_of(positions: Any, ceilings: Any) -> Any:
+    """Returns the number of ceilings below each position (n, 3)."""
+    return namespace(positions).sum(positions[:, 2, None] > ceilings, -1)
+
+
 def law_features(tx: Any, receivers: Any, walls: Walls, ceilings: Any) -> Any:
     """Returns the factors (b, r, 4 + c) of the law's parameters: four of all walls, and the additional loss of each class."""
     xp = namespace(tx)
@@ -154,8 +160,7 @@ def law_features(tx: Any, receivers: Any, walls: Walls, ceilings: Any) -> Any:
     each = crossed(walls, tx[:, None, :2], receivers[None, :, :2])
     between = xp.sum(each, -1)
     root = xp.sqrt(xp.where(between > 0, between, 1.0)) * (between > 0)
-    below = [xp.sum(at[:, 2, None] > ceilings, -1) for at in (tx, receivers)]
-    storeys = xp.abs(below[0][:, None] - below[1])
+    storeys = xp.abs(storeys_of(tx, ceilings)[:, None] - storeys_of(receivers, ceilings))
     decrease = 0.46  # b of COST 231, section 4.7
     further = xp.maximum(storeys, 1) ** ((storeys + 2) / (storeys + 1) - decrease) * (storeys > 0)
     law = xp.stack([xp.ones_like(distance), -10 * xp.log10(distance), -root, -further], -1)
@@ -179,21 +184,28 @@ def fit_law(
     for r in range(len(readings.receivers)):
         own = cube.reshape(-1)[received[:, r]]
         weights[received[:, r], r] = 1 / (APART**2 * np.bincount(own, minlength=cube.max() + 1)[own])
-    left = np.where(received, readings.powers - features @ prior, 0)
+    left = residuals(readings, features, prior)
     precision = np.einsum("nri,nr,nrj->ij", features, weights, features) + np.diag(width**-2.0)
     law_covariance = np.linalg.inv(precision)
     return prior + law_covariance @ np.einsum("nri,nr,nr->i", features, weights, left), law_covariance
 
 
+def residuals(
+    readings: Readings, features: Float[np.ndarray, "n r k"], law: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "n r"]:
+    """Returns what a law leaves of the powers (dB); 0 where nothing was received."""
+    return np.where(np.isfinite(readings.powers), readings.powers - features @ law, 0)
+
+
 def covariance_of_powers(
     scales: Scales,
     readings: Readings,
-    crossed: Float[np.ndarray, "n r 2"],
+    root_walls: Float[np.ndarray, "n r"],
     shared: Float[np.ndarray, "n n"],
     own: Int[np.ndarray, " m"],
     r: int,
 ) -> Float[np.ndarray, "m m"]:
     """Returns the covariance (dB^2) of the residuals of the mean powers of the places `own` at receiver r, with their noise."""
-    places, walls = readings.places[own], crossed[own, r, 0]
+    places, walls = readings.places[own], root_walls[own, r]
     k = covariance(scales, distances(places, places), shared[np.ix_(own, own)], walls[:, None], walls)
     return np.asarray(k) + np.diag(noise(scales, readings.counts[own, r]))

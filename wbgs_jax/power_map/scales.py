@@ -89,12 +89,18 @@ def noise(scales: Scales, counts: Float[np.ndarray, "*n"]) -> Float[np.ndarray, 
     return float(scales.place) ** 2 + float(scales.reading) ** 2 / counts
 
 
-def learn_scales(readings: Readings, crossed: Float[np.ndarray, "n r 2"], left: Float[np.ndarray, "n r"]) -> Scales:
+def learn_scales(
+    readings: Readings,
+    root_walls: Float[np.ndarray, "n r"],
+    shared: Float[np.ndarray, "n n"],
+    left: Float[np.ndarray, "n r"],
+) -> Scales:
     """Returns the scales of maximum posterior probability, with the values of `Scales` as prior medians.
 
     Args:
         readings: positions and numbers of readings.
-        crossed: sqrt(w) and L(k) of every link.
+        root_walls: sqrt(w) of every link.
+        shared: `in_one_room` of all positions.
         left: residuals of the law, dB.
     """
     first, widths = np.log([*vars(Scales()).values()]), np.array([*vars(WIDTHS).values()])
@@ -105,17 +111,16 @@ def learn_scales(readings: Readings, crossed: Float[np.ndarray, "n r 2"], left: 
     for r in np.flatnonzero(received.any(0)):
         own = shuffled[received[shuffled, r]][:looked_at]
         apart = distances(readings.places[own], readings.places[own])
-        by_walls = alike(apart) * np.outer(crossed[own, r, 0], crossed[own, r, 0])
-        shared = in_one_room(crossed[own], crossed[own])
-        chosen.append((apart, by_walls, shared, 1 / readings.counts[own, r], left[own, r]))
+        by_walls = alike(apart) * np.outer(root_walls[own, r], root_walls[own, r])
+        chosen.append((apart, by_walls, shared[np.ix_(own, own)], 1 / readings.counts[own, r], left[own, r]))
 
     def negative_log_posterior(logs: np.ndarray) -> tuple[float, np.ndarray]:
         away = (logs - first) / widths
         total, gradient = 0.5 * np.sum(away**2), away / widths
         near, far, wall, gain, place, reading, _ = np.exp(2 * logs)
         length = np.exp(logs[-1])
-        for apart, by_walls, shared, shares, values in chosen:
-            close, wide = alike(apart), shared * np.exp(-apart / length)
+        for apart, by_walls, in_room, shares, values in chosen:
+            close, wide = alike(apart), in_room * np.exp(-apart / length)
             k = near * close + far * wide + wall * by_walls + gain
             k[np.diag_indices(len(values))] += place + reading * shares
             factor = cho_factor(k, lower=True)

@@ -12,7 +12,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.floor_plan import FILES, NO_WALLS, Walls, load_walls
 from wbgs_jax.data.rssi_folder import Readings, cell_means, load_readings
 from wbgs_jax.inference.domain import Domain
-from wbgs_jax.power_map.model import MAX_PLACES, find_ceilings
+from wbgs_jax.power_map.model import MAX_PLACES, find_ceilings, storeys_of
 
 HEIGHT_M = 1.3
 """Height of the transmitters above the floor if the readings have no z."""
@@ -115,7 +115,7 @@ def _note_storeys(folder: Path, cells: Readings) -> None:
             f"{folder}: readings lie on {len(ceilings) + 1} storeys; ceilings at z = {listed} m attenuate in the map",
             stacklevel=3,
         )
-    of_storey = np.sum(heights[:, None] > ceilings, -1)
+    of_storey = storeys_of(cells.places, ceilings)
     high = max(float(np.ptp(heights[of_storey == one])) for one in np.unique(of_storey))
     if high > ONE_STOREY_M:
         warnings.warn(

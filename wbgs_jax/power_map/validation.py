@@ -20,7 +20,16 @@ from wbgs_jax._util.progress_lines import CountProgress
 from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.data.floor_plan import NO_WALLS, Walls, crossings
 from wbgs_jax.data.rssi_folder import Readings
-from wbgs_jax.power_map.model import APART, MIN_POWERS, NEAREST, covariance_of_powers, find_ceilings, fit_law, law_features
+from wbgs_jax.power_map.model import (
+    APART,
+    MIN_POWERS,
+    NEAREST,
+    covariance_of_powers,
+    find_ceilings,
+    fit_law,
+    law_features,
+    residuals,
+)
 from wbgs_jax.power_map.scales import Scales, alike, distances, in_one_room, learn_scales, noise
 
 BLOCK, FOLDS = 1.0, 40
@@ -159,15 +168,15 @@ def _mapped(parts: Parts, cells: Readings, walls: Walls) -> tuple[Float[np.ndarr
     """
     features = law_features(cells.places, cells.receivers, walls, find_ceilings(cells.places[:, 2]))
     crossed, received = -features[..., 2:4], np.isfinite(cells.powers)
-    shared = in_one_room(crossed, crossed)
+    root_walls, shared = crossed[..., 0], in_one_room(crossed, crossed)
     largest = cells.without(max(parts, key=np.sum))
     law, _ = fit_law(largest, features)
-    scales = learn_scales(largest, crossed, np.where(np.isfinite(largest.powers), largest.powers - features @ law, 0))
+    scales = learn_scales(largest, root_walls, shared, residuals(largest, features, law))
     laws = [fit_law(cells.without(part), features) for part in parts]
     mean, variance = (np.full(cells.powers.shape, np.nan) for _ in range(2))
     for r, mask in enumerate(received.T):
         own = np.flatnonzero(mask)
-        inverse = np.linalg.inv(covariance_of_powers(scales, cells, crossed, shared, own, r))
+        inverse = np.linalg.inv(covariance_of_powers(scales, cells, root_walls, shared, own, r))
         for part, (law, law_covariance) in zip(parts, laws, strict=True):
             out = part[own]
             if out.any():

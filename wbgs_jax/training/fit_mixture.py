@@ -23,14 +23,7 @@ from scipy.special import expit, logit
 from wbgs_jax._util.statistics import lower_bound, standard_error
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields.mixture import SHARES, USUAL_SPREAD, score_at, similarity
-from wbgs_jax.inference.kriging import (
-    LOG_METRE,
-    MEMBERS,
-    Mixture,
-    member_spectra,
-    member_weights,
-    scaled_distance,
-)
+from wbgs_jax.inference.kriging import LOG_METRE, MEMBERS, Mixture, member_spectra, member_weights, scaled_distance
 from wbgs_jax.training.fit_kriging import scattered, spacing
 
 STRIDE = 8

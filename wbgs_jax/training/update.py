@@ -403,16 +403,20 @@ def _without_places(correction: Any, stale: Float[np.ndarray, "n 3"]) -> Any:
     """Returns measured spectra that correct predictions without those of stale places; None if none remain."""
     if correction is None or not len(stale):
         return correction
-    away = cKDTree(stale).query(np.asarray(correction.tx_position))[0]
-    return some_of(correction, np.flatnonzero(away > SAME_PLACE_M))
+    return some_of(correction, np.flatnonzero(_elsewhere(correction, stale)))
 
 
 def _far_from(intervals: C | None, stale: Float[np.ndarray, "n 3"]) -> C | None:
     """Returns a regression without stale places, unless none would remain."""
     if intervals is None or not len(stale):
         return intervals
-    away = cKDTree(stale).query(np.asarray(intervals.tx_position))[0] > SAME_PLACE_M
+    away = _elsewhere(intervals, stale)
     return dataclasses.replace(intervals, tx_position=intervals.tx_position[away]) if away.any() else intervals
+
+
+def _elsewhere(learned: Any, stale: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " m"]:
+    """Returns which places of something learned are not stale."""
+    return np.asarray(cKDTree(stale).query(np.asarray(learned.tx_position))[0] > SAME_PLACE_M)
 
 
 def scene_of(dataset: Dataset, source: str) -> SceneFile:

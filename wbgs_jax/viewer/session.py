@@ -128,8 +128,6 @@ class Session:
         self._use(loaded)
 
     def _use(self, loaded: LoadedField) -> None:
-        self.altered = False
-        """Whether materials are not as trained, so that no interval applies."""
         self.loaded, self.trained, self.receiver, self.plan = loaded, loaded.trained, loaded.receiver, loaded.plan
         learned = self.trained.correction, self.trained.intervals
         self._neighbours, self._confidence = (for_receiver(one, self.receiver) for one in learned)
@@ -147,6 +145,11 @@ class Session:
         """
         trained = at_receiver(self._whole, receiver, self.dataset)
         self._use(dataclasses.replace(self.loaded, trained=trained, receiver=receiver))
+
+    @property
+    def altered(self) -> bool:
+        """Whether materials are not as trained, so that no interval applies."""
+        return self.trained is not self.loaded.trained
 
     @property
     def movable(self) -> bool:
@@ -259,7 +262,7 @@ class Session:
         found = self._calibratable()
         own = found.field.with_material(found.of(self.trained.params), number, permittivity, conductivity)
         params = found.put(self.trained.params, own)
-        self.trained, self.altered = dataclasses.replace(self.trained, params=params), True
+        self.trained = dataclasses.replace(self.trained, params=params)
         self._changed()
 
     def change_thickness(self, number: int, metres: float) -> None:
@@ -267,7 +270,7 @@ class Session:
         found = self._calibratable()
         own, planned = found.field.with_thickness(found.of(self.plan), number, metres)
         field, self.plan = found.put(self.trained.field, own), found.put(self.plan, planned)
-        self.trained, self.altered = dataclasses.replace(self.trained, field=field), True
+        self.trained = dataclasses.replace(self.trained, field=field)
         self._changed()
 
     def _calibratable(self) -> Ability[Calibratable]:
@@ -277,7 +280,7 @@ class Session:
 
     def restore(self) -> None:
         """Uses the materials as trained for later queries."""
-        self.trained, self.plan, self.altered = self.loaded.trained, self.loaded.plan, False
+        self.trained, self.plan = self.loaded.trained, self.loaded.plan
         self._changed()
 
     def _links_with_spectra(self) -> Int[np.ndarray, " n"]:
