@@ -26,8 +26,8 @@ from data_gen.scenes.base import RX_CLEARANCE, TX_CLEARANCE
 from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.progress_lines import CountProgress
+from wbgs_jax.data.dataset import tx_disjoint_split
 from wbgs_jax.data.scene_file import TEST, SceneFile, save_scene
-from wbgs_jax.data.splits import tx_disjoint_split
 
 TEST_FRACTION = 0.2
 SPLIT_SEED = 0

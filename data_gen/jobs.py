@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from data_gen.cluster import LOCAL, connected, finished
 from data_gen.llvm import find_backend, use_backend
 from data_gen.scenes.base import SceneSpec
 from data_gen.settings import ArraySettings, SolverSettings
-from wbgs_jax._util.dask_cluster import LOCAL, connected, finished
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, read_arrays
 

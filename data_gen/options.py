@@ -16,7 +16,7 @@ from data_gen.scenes.changes import changed
 from data_gen.settings import ArraySettings, Solver, SolverSettings
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.load import RELEASED
-from wbgs_jax.interchange.room_materials import check_material_frequencies
+from wbgs_jax.interchange.rooms import check_material_frequencies
 
 HERE = Path(__file__).parent
 SUBSET_SEED = 0

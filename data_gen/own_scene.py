@@ -15,8 +15,7 @@ from data_gen.mesh_checks import is_solid, kind, outward, place, surface_flaws
 from data_gen.scenes.base import FREQUENCIES_HZ, RX_CLEARANCE, Part, SceneSpec, grid_3d
 from data_gen.scenes.geometry import Vec3, distance, winding_number
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.interchange.room_materials import Slab, check_material_frequencies
-from wbgs_jax.interchange.rooms import RoomObject, describe_room, read_room
+from wbgs_jax.interchange.rooms import RoomObject, Slab, check_material_frequencies, describe_room, read_room
 
 MAX_TX = 1_000_000
 

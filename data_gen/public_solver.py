@@ -21,7 +21,7 @@ from data_gen.scenes.base import Part
 from data_gen.settings import SolverSettings
 from data_gen.trace import check_room, electrical_constants
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.interchange.room_materials import own_law
+from wbgs_jax.interchange.rooms import own_law
 
 
 def public_material(name: str, part: Part, settings: SolverSettings) -> rt.RadioMaterial:

@@ -27,7 +27,7 @@ from data_gen.rays import RayLauncher
 from data_gen.scenes.base import SceneSpec
 from data_gen.settings import ArraySettings, SolverSettings
 from data_gen.trace import BalancedMaterial, DiffuseTracer, PathTracer
-from wbgs_jax.interchange.room_materials import check_frequency
+from wbgs_jax.interchange.rooms import check_frequency
 
 FAINT = 1e-15
 """Amplitude (-300 dB) below which a path is dropped. The simulator keeps a path of subnormal power at random, because some of

@@ -27,7 +27,7 @@ from data_gen.scenes.base import Part, SceneSpec
 from data_gen.settings import SolverSettings
 from data_gen.utd import diffraction_matrix, end_unused_vertices
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.interchange.room_materials import own_law
+from wbgs_jax.interchange.rooms import own_law
 
 
 def electrical_constants(material: str) -> Callable[[Any], tuple[Any, Any]]:

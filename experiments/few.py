@@ -26,7 +26,7 @@ from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.commands.train import learn_beside
 from wbgs_jax.config import Settings
 from wbgs_jax.data import Dataset, load_dataset
-from wbgs_jax.data.splits import fewer_transmitters, hold_out_validation, training_links
+from wbgs_jax.data.dataset import fewer_transmitters, hold_out_validation, training_links
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.evaluation.score import evaluate
 from wbgs_jax.fields import default_field, get_field

@@ -16,7 +16,7 @@ from experiments.paper import COMBINATIONS, DENSE_SCENE, GHZ_10, GHZ_21, SCENES
 from experiments.profiles import PROFILES, TABLE_PROFILES
 from experiments.variants import VARIANTS
 from wbgs_jax.data import Dataset, load_dataset
-from wbgs_jax.data.splits import hold_out_box, hold_out_validation, select_frequencies, unseen_frequencies
+from wbgs_jax.data.dataset import hold_out_box, hold_out_validation, select_frequencies, unseen_frequencies
 from wbgs_jax.fields import default_field
 
 FIXED_SCENE = "2_fixed"

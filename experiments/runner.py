@@ -26,6 +26,7 @@ from typing import Literal
 import jax
 import tyro
 
+from data_gen.cluster import connected, finished
 from experiments.catalogue import EXPERIMENTS, unique_jobs
 from experiments.execute import execute
 from experiments.jobs import Job
@@ -33,7 +34,6 @@ from experiments.paper import DENSE_SCENE
 from experiments.results import FOLDER, Results
 from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
-from wbgs_jax._util.dask_cluster import connected, finished
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.training.loop import Interrupted
 from wbgs_jax.training.run_folder import Taken, locked

@@ -24,8 +24,7 @@ from wbgs_jax._util.files import read_yaml, safe_name
 from wbgs_jax.commands import evaluate as evaluation
 from wbgs_jax.commands import predict
 from wbgs_jax.data import load_dataset, save_scene
-from wbgs_jax.data.dataset import checksum
-from wbgs_jax.data.splits import hold_out_validation
+from wbgs_jax.data.dataset import checksum, hold_out_validation
 from wbgs_jax.training import checkpoint
 from wbgs_jax.training.loop import Run
 from wbgs_jax.training.run_folder import FILE, load_trained, locked

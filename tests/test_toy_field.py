@@ -20,8 +20,8 @@ from wbgs_jax.commands import evaluate as eval_command
 from wbgs_jax.commands import predict as predict_command
 from wbgs_jax.commands import train as train_command
 from wbgs_jax.config import PRESETS
+from wbgs_jax.data.dataset import hold_out_validation, select_receivers
 from wbgs_jax.data.scene_file import save_scene
-from wbgs_jax.data.splits import hold_out_validation, select_receivers
 from wbgs_jax.evaluation.score import evaluate, watch
 from wbgs_jax.fields import base
 from wbgs_jax.fields.base import Group, with_field

@@ -23,10 +23,6 @@ from .fields import pas as pas
 from .fields import register as register
 from .fields import wideband as wideband
 from .fields.losses import ssim as ssim
-from .inference.batching import map_queries as map_queries
-from .inference.batching import predict_blocks as predict_blocks
-from .inference.batching import predict_many as predict_many
-from .inference.batching import predict_map as predict_map
 from .inference.evaluate_quantities import predict_paths as predict_paths
 from .inference.export import export_field as export_field
 from .inference.export import load_exported as load_exported
@@ -34,6 +30,10 @@ from .inference.intervals import expected_power as expected_power
 from .inference.intervals import expected_ssim as expected_ssim
 from .inference.predictor import make_power_predictor as make_power_predictor
 from .inference.predictor import make_predictor as make_predictor
+from .inference.predictor import map_queries as map_queries
+from .inference.predictor import predict_blocks as predict_blocks
+from .inference.predictor import predict_many as predict_many
+from .inference.predictor import predict_map as predict_map
 from .inference.trained_field import TrainedField as TrainedField
 from .inference.trained_field import at_receiver as at_receiver
 from .radio.channel import Paths as Paths

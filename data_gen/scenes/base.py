@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from data_gen.scenes.geometry import Vec3, crossings, distance, winding_number
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.interchange.room_materials import THICKNESS, check_material
+from wbgs_jax.interchange.rooms import THICKNESS, check_material
 
 GAP = 0.01
 """Metres between furniture and the floor or wall beside it, which keeps surfaces apart and hides nothing."""

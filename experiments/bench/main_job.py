@@ -20,7 +20,7 @@ from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.files import write_json
 from wbgs_jax.config import Settings, changed
 from wbgs_jax.data import load_dataset
-from wbgs_jax.data.splits import hold_out_validation
+from wbgs_jax.data.dataset import hold_out_validation
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.fields import get_field
 from wbgs_jax.training.loop import Run

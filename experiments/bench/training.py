@@ -20,7 +20,7 @@ from wbgs_jax._util.cli import say
 from wbgs_jax.commands.train import default_preset
 from wbgs_jax.config import Settings, changed
 from wbgs_jax.data import load_dataset
-from wbgs_jax.data.splits import hold_out_validation
+from wbgs_jax.data.dataset import hold_out_validation
 from wbgs_jax.fields import get_field, wideband
 from wbgs_jax.fields.losses import image_loss
 from wbgs_jax.splat import GeometryPlan, geometry_plan, render_splats

@@ -12,8 +12,7 @@ from experiments.bench.scene import Scene, random_scene, temporary_gb
 from experiments.bench.timing import Effort, interleaved
 from experiments.gpu_check.record import Record, rounded
 from wbgs_jax.splat import geometry_plan, render_splats
-from wbgs_jax.splat.composite import assembled, blend_by_tiles, blend_by_tiles_backward
-from wbgs_jax.splat.render import GeometryPlan
+from wbgs_jax.splat.composite import GeometryPlan, assembled, blend_by_tiles, blend_by_tiles_backward
 
 SIZES = ((2_000, 1), (10_000, 8), (20_000, 1), (35_000, 1), (70_000, 1), (70_000, 8))
 """Gaussians and queries."""

@@ -27,9 +27,8 @@ from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import write_json
-from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.dataset import Dataset, keep_links
 from wbgs_jax.data.load import load_dataset
-from wbgs_jax.data.splits import keep_links
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.inference.predictor import observe_links

@@ -23,12 +23,12 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import write_json
 from wbgs_jax.config import CalibrationConfig
 from wbgs_jax.data import Dataset, load_dataset
-from wbgs_jax.data.splits import hold_out_validation
+from wbgs_jax.data.dataset import hold_out_validation
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.fields import mixture
 from wbgs_jax.fields.mixture import SHARES
 from wbgs_jax.training import fit_kriging
-from wbgs_jax.training.calibration import alignment, array_gains, obstacles, propagation_options, thickness
+from wbgs_jax.training.calibration import alignment, antennas, material_fit, obstacles, pipeline
 from wbgs_jax.training.calibration.objective import surely_better
 from wbgs_jax.training.fit_mixture import ERRORS, ERRORS_WITH_PATHS, choose_share
 from wbgs_jax.training.loop import VALIDATION_LINKS
@@ -63,10 +63,10 @@ def decisions() -> tuple[Decision, ...]:
     return (
         Decision("antennas", own.antenna_spectra, "train", own.antenna_n_sigma, "isotropic, or what the data name"),
         Decision("materials, against the list", own.spectra, "train", own.n_sigma, "an entry of the list"),
-        Decision("thicknesses", own.thickness_spectra, "train", thickness.SURE, "the thickness that is there"),
+        Decision("thicknesses", own.thickness_spectra, "train", material_fit.SURE, "the thickness that is there"),
         Decision("absent bodies", own.spurious_spectra, "train", obstacles.SURE, "all bodies are there"),
-        Decision("idealisations", own.propagation_spectra, "train", propagation_options.SURE, "as ray tracers have it"),
-        Decision("array tuning", own.array_gain_spectra // 2, "train", array_gains.SURE, "elements in tune"),
+        Decision("idealisations", own.propagation_spectra, "train", pipeline.SURE, "as ray tracers have it"),
+        Decision("array tuning", own.array_gain_spectra // 2, "train", antennas.SURE, "elements in tune"),
         Decision("geometry", own.geometry_snapshots, "train", alignment.SURE, "the mesh as it is"),
         Decision("clutter", own.absorption_spectra, "train", obstacles.SURE_OF_CLUTTER, "none"),
         Decision("noise floor", mixture.COMPARED, "validation", mixture.SURE, "none"),

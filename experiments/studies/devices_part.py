@@ -20,9 +20,8 @@ from jaxtyping import Int
 from wbgs_jax._util.devices import AXIS, connect
 from wbgs_jax._util.files import write_json
 from wbgs_jax.config import Settings, changed
-from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.dataset import Dataset, fewer_transmitters, hold_out_validation
 from wbgs_jax.data.load import load_dataset
-from wbgs_jax.data.splits import fewer_transmitters, hold_out_validation
 from wbgs_jax.fields import get_field
 from wbgs_jax.training import loop
 from wbgs_jax.training.hooks import Context, probe_of

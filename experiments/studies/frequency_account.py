@@ -21,7 +21,7 @@ from wbgs_jax import metrics
 from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.files import write_json
 from wbgs_jax.data import Dataset, load_dataset
-from wbgs_jax.data.splits import hold_out_validation
+from wbgs_jax.data.dataset import hold_out_validation
 from wbgs_jax.evaluation.report import environment
 
 NEIGHBOURS = 4

@@ -31,7 +31,7 @@ from wbgs_jax.inference.predictor import observe
 from wbgs_jax.inference.radio_map import cut_at
 from wbgs_jax.metrics import ssim
 from wbgs_jax.training.run_folder import load_trained
-from wbgs_jax.viewer.walk import stops
+from wbgs_jax.viewer.session import stops_of_walk
 
 COLORS = 256
 """In the file."""
@@ -56,7 +56,7 @@ class Command:
 def links_of_walk(dataset: Dataset, count: int, per_stop: int) -> Int[np.ndarray, " frames"]:
     """Returns test links at some transmitters in the order of a walk, their frequencies in turn."""
     test = dataset.test
-    way = stops(dataset.tx_positions[test], count)
+    way = stops_of_walk(dataset.tx_positions[test], count)
     ghz, chosen, turn = np.unique(dataset.frequencies_hz[test]), [], 0
     for place in way:
         here = test[np.linalg.norm(dataset.tx_positions[test] - place, axis=1) < 1e-6]

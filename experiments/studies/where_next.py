@@ -22,8 +22,7 @@ from wbgs_jax._util.files import write_json
 from wbgs_jax.applications import choose_next_places
 from wbgs_jax.data.rssi_folder import Readings
 from wbgs_jax.evaluation.report import environment
-from wbgs_jax.power_map.model import learn_map, received_power
-from wbgs_jax.power_map.scales import LENGTH
+from wbgs_jax.power_map.model import LENGTH, learn_map, received_power
 from wbgs_jax.power_map.survey import load_survey
 
 SETS = {"ble_flat": 100, "ble_tetam": 40}

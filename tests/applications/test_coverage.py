@@ -10,8 +10,14 @@ from builders.rooms import METAL, SPEED_OF_LIGHT, field_of, rectangle
 from builders.untrained import make_field, make_params
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.applications.antenna_placement import mean_power, place_antenna, power_at_users, soft_minimum, tenth_percentile
-from wbgs_jax.applications.array_orientation import predict_isotropic_paths
+from wbgs_jax.applications.antenna_placement import (
+    mean_power,
+    place_antenna,
+    power_at_users,
+    predict_isotropic_paths,
+    soft_minimum,
+    tenth_percentile,
+)
 from wbgs_jax.applications.reflector import straight_powers
 from wbgs_jax.radio.antenna import upright
 

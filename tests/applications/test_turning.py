@@ -8,7 +8,7 @@ from builders.mirrors import Blind
 from builders.rooms import METAL, field_of, rectangle
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.applications.array_orientation import (
+from wbgs_jax.applications.antenna_placement import (
     boresight_quaternion,
     power_when_rotated,
     predict_isotropic_paths,

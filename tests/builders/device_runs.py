@@ -15,9 +15,8 @@ from builders.synthetic import tiny_dataset, tiny_settings
 from builders.toys import GROWING, as_trained
 from wbgs_jax._util.devices import COORDINATOR, Devices, connect
 from wbgs_jax.config import Settings, changed
-from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.splits import hold_out_validation
-from wbgs_jax.inference import batching, predictor
+from wbgs_jax.data.dataset import Dataset, hold_out_validation
+from wbgs_jax.inference import predictor
 from wbgs_jax.training.loop import TrainResult, train
 
 FOUR = {"optim": {"batch": 4}, "loop": {"epoch_steps": 4, "checkpoint_every": 4}}
@@ -42,13 +41,13 @@ def answers(result: TrainResult, dataset: Dataset) -> list[np.ndarray]:
     links = predictor.observe_links(result.field, result.params, dataset, np.arange(ASKED)).pas
     queries = predictor.observe_queries(trained, receiver, query, "pas")
     ask = predictor.make_predictor(trained, receiver)
-    return [links, queries, batching.predict_many(ask, query.tx_position, query.frequency_hz)]
+    return [links, queries, predictor.predict_many(ask, query.tx_position, query.frequency_hz)]
 
 
 def asked_by_all_and_by_one(result: TrainResult, dataset: Dataset) -> float:
     """The largest difference between the answers of all devices and of one."""
     together = answers(result, dataset)
-    predictor.own_devices = batching.own_devices = Devices  # type: ignore[assignment]
+    predictor.own_devices = predictor.own_devices = Devices  # type: ignore[assignment]
     alone = answers(result, dataset)
     return max(float(np.abs(a - b).max()) for a, b in zip(together, alone, strict=True))
 

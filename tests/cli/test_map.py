@@ -21,7 +21,7 @@ from wbgs_jax.inference.intervals import PowerConfidence, write_confidence
 from wbgs_jax.inference.quantities import QUANTITIES, Network
 from wbgs_jax.inference.radio_map import cut_at, pieces, plane_over
 from wbgs_jax.radio.array import codebook
-from wbgs_jax.radio.network import noise_dbm, sinr_db, throughput_bps
+from wbgs_jax.radio.channel import noise_dbm, sinr_db, throughput_bps
 from wbgs_jax.training.run_folder import load_trained
 
 AREA = ["--area", "-1,0:1,1", "--height", "1.3"]

@@ -9,7 +9,7 @@ import pytest
 from builders.synthetic import FIXED_ARRAY_HZ, FREQUENCIES_HZ, RECEIVERS, tiny_dataset
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.splits import select_receivers
+from wbgs_jax.data.dataset import select_receivers
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, pas_directions, planar_array, snapshot_to_pas
 from wbgs_jax.radio.geometry import to_local
 from wbgs_jax.types import Batch, Query, make_receiver, stack_receivers

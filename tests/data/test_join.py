@@ -8,8 +8,8 @@ from builders.synthetic import tiny_dataset, tiny_scene
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import load_dataset, save_scene
+from wbgs_jax.data.dataset import select_receivers
 from wbgs_jax.data.load import join
-from wbgs_jax.data.splits import select_receivers
 
 
 @pytest.fixture

@@ -14,9 +14,8 @@ from builders.toys import RippleField, registered, toy_settings
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.data import load_dataset, load_scene, save_scene
-from wbgs_jax.data.dataset import checksum
+from wbgs_jax.data.dataset import checksum, hold_out_validation, select_receivers, without_test
 from wbgs_jax.data.load import join
-from wbgs_jax.data.splits import hold_out_validation, select_receivers, without_test
 from wbgs_jax.evaluation.score import watch
 from wbgs_jax.fields import losses
 from wbgs_jax.observation_kinds import KINDS, Kind, only_kind, power_of, spectra_of

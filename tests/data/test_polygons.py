@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wbgs_jax.mesh.polygons import triangulate
+from wbgs_jax.mesh.bodies import triangulate
 
 L_SHAPE = [(0, 0), (6, 0), (6, 2), (2, 2), (2, 5), (0, 5)]
 COMB = [

@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import load_dataset
-from wbgs_jax.data.load import scene_dataset
+from wbgs_jax.data.load import CONJUGATE, REORDERED, scene_dataset
 from wbgs_jax.data.scene_file import save_scene
-from wbgs_jax.data.snapshot_frames import CONJUGATE, REORDERED
 from wbgs_jax.interchange.scenes import scene_of_snapshots
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
 

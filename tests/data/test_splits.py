@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import scene_dataset
-from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.splits import (
+from wbgs_jax.data.dataset import (
+    Dataset,
     fewer_transmitters,
     group_places,
     group_transmitters,

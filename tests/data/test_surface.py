@@ -8,9 +8,8 @@ import trimesh
 from builders.synthetic import RECEIVERS, ROOM, tiny_dataset
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.dataset import Dataset, Materials
+from wbgs_jax.data.dataset import Dataset, Materials, select_receivers
 from wbgs_jax.data.scene import MESH_SIZED, DatasetScene, make_mesh, make_surface, surface_from_points
-from wbgs_jax.data.splits import select_receivers
 from wbgs_jax.types import Scene, make_receiver, stack_receivers
 
 RX = (-3.0, 0.5, 1.0)

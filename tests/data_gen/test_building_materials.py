@@ -5,36 +5,36 @@ import math
 import pytest
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.interchange import room_materials
-from wbgs_jax.interchange.room_materials import Law, check_material_frequencies, own_law, own_material
+from wbgs_jax.interchange import rooms
+from wbgs_jax.interchange.rooms import Law, check_material_frequencies, own_law, own_material
 
 
 def test_materials_of_the_released_scenes_cover_the_whole_band():
-    assert set(room_materials.THICKNESS) == {"concrete", "plasterboard", "wood", "glass", "ceiling_board", "chipboard", "metal"}
-    check_material_frequencies(room_materials.THICKNESS, room_materials.VALID_HZ)
+    assert set(rooms.THICKNESS) == {"concrete", "plasterboard", "wood", "glass", "ceiling_board", "chipboard", "metal"}
+    check_material_frequencies(rooms.THICKNESS, rooms.VALID_HZ)
 
 
 def test_thicknesses_are_those_of_slabs():
-    assert all(0.001 < material.thickness <= 0.5 for material in room_materials.ITU.values())
+    assert all(0.001 < material.thickness <= 0.5 for material in rooms.ITU.values())
 
 
 @pytest.mark.usefixtures("simulator_backend")
 def test_the_table_is_the_simulators():
     from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
 
-    assert set(room_materials.ITU) == set(ITU_MATERIALS_PROPERTIES) - {"vacuum"}
-    for name, (_, low, high) in room_materials.ITU.items():
+    assert set(rooms.ITU) == set(ITU_MATERIALS_PROPERTIES) - {"vacuum"}
+    for name, (_, low, high) in rooms.ITU.items():
         first, last = next(iter(ITU_MATERIALS_PROPERTIES[name]))  # the lowest band is listed first
         assert low == first and math.isclose(high, last, rel_tol=1e-4), name
 
 
 @pytest.mark.usefixtures("simulator_backend")
-@pytest.mark.parametrize("name", sorted(room_materials.ITU))
+@pytest.mark.parametrize("name", sorted(rooms.ITU))
 def test_the_simulator_takes_a_material_at_both_ends_of_its_band(name):
     import mitsuba as mi
     from sionna.rt.radio_materials.itu import itu_material
 
-    _, low, high = room_materials.ITU[name]
+    _, low, high = rooms.ITU[name]
     for ghz in (low, high):
         permittivity, conductivity = itu_material(name, mi.Float(ghz * 1e9))
         assert permittivity[0] >= 1 and conductivity[0] >= 0

@@ -79,7 +79,7 @@ def test_the_guide_shows_the_example():
 
 
 def test_the_guide_lists_every_material():
-    from wbgs_jax.interchange.room_materials import ITU
+    from wbgs_jax.interchange.rooms import ITU
 
     text = GUIDE[GUIDE.index("The materials of ITU-R P.2040") :]
     for name, (thickness, low, _) in ITU.items():

@@ -67,7 +67,7 @@ def test_a_snapshot_is_the_frequency_response_that_the_simulator_gives(simulator
 
 def test_materials_are_the_simulators_own_and_those_of_a_user():
     from data_gen.public_solver import public_material
-    from wbgs_jax.interchange.room_materials import Law, own_material
+    from wbgs_jax.interchange.rooms import Law, own_material
 
     itu = public_material("itu", room().parts[0], THEIRS)
     assert type(itu).__module__.startswith("sionna") and itu.itu_type == "concrete"

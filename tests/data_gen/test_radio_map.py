@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wbgs_jax.radio.network import noise_dbm, sinr_db
+from wbgs_jax.radio.channel import noise_dbm, sinr_db
 
 pytestmark = pytest.mark.usefixtures("simulator_backend")
 

@@ -14,7 +14,7 @@ from data_gen.scenes.base import RX_CLEARANCE, TX_CLEARANCE
 from data_gen.scenes.geometry import crossings, winding_number
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.load import RELEASED
-from wbgs_jax.interchange import room_materials
+from wbgs_jax.interchange import rooms
 
 MAX_TRIANGLES = 2500
 OPEN_ROOMS, FLATS = (1, 6), (2, 3, 4, 5)
@@ -213,10 +213,10 @@ def test_distances_are_those_to_all_triangles(spec, tx, rng):
 
 def test_materials_are_valid_at_all_frequencies(spec):
     for p in spec.parts:
-        room_materials.check_material(p.material)
+        rooms.check_material(p.material)
         assert 0 < p.thickness < 0.5
     for frequency in spec.frequencies_hz:
-        room_materials.check_frequency(frequency)
+        rooms.check_frequency(frequency)
 
 
 def test_grid_counts(spec, tx):
@@ -282,7 +282,7 @@ def test_mesh_arrays_hold_every_part(spec):
 def test_frequency_sets():
     assert len(FREQUENCIES_HZ) == 10 and len(FREQUENCIES_21_HZ) == 21
     assert FREQUENCIES_21_HZ[:3] == (1e9, 5e9, 10e9) and FREQUENCIES_21_HZ[-1] == 100e9
-    assert all(room_materials.check_frequency(f) for f in (*FREQUENCIES_HZ, *FREQUENCIES_21_HZ))
+    assert all(rooms.check_frequency(f) for f in (*FREQUENCIES_HZ, *FREQUENCIES_21_HZ))
 
 
 def test_scene_1_is_the_released_one():
@@ -300,7 +300,7 @@ def test_all_scenes_together():
 @pytest.mark.parametrize("frequency", [0.0, 0.9e9, 100.1e9, float("nan")])
 def test_frequency_without_materials_is_refused(frequency):
     with pytest.raises(UserError, match="GHz"):
-        room_materials.check_frequency(frequency)
+        rooms.check_frequency(frequency)
 
 
 def test_unknown_scene_is_refused():

@@ -9,8 +9,7 @@ from builders.synthetic import tiny_scene
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import load_dataset, scene_dataset
-from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.splits import select_frequencies, select_receivers
+from wbgs_jax.data.dataset import Dataset, select_frequencies, select_receivers
 from wbgs_jax.evaluation import baselines as module
 from wbgs_jax.evaluation.baselines import baselines
 from wbgs_jax.metrics import score

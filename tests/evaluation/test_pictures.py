@@ -9,7 +9,7 @@ from matplotlib import pyplot as plt
 from PIL import Image
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.splits import hold_out_validation, select_frequencies
+from wbgs_jax.data.dataset import hold_out_validation, select_frequencies
 from wbgs_jax.inference.quantities import QUANTITIES, names_for
 from wbgs_jax.inference.queries import Queries
 from wbgs_jax.metrics import score

@@ -14,8 +14,8 @@ from builders.toys import NoisyField, RippleConfig, RippleField, as_trained
 from wbgs_jax import metrics
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
+from wbgs_jax.data.dataset import hold_out_validation
 from wbgs_jax.data.scene import in_sight
-from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.evaluation.baselines import baselines
 from wbgs_jax.evaluation.report import closing_lines, table
 from wbgs_jax.evaluation.score import evaluate, held_out, power_figures, score_snapshots, watch

@@ -12,8 +12,8 @@ from experiments.bench.main_job import measure
 from experiments.studies import frequency_account, neighbours_account, receivers_account
 from experiments.studies.frequency_account import LAWS, polynomial
 from wbgs_jax.config import changed
+from wbgs_jax.data.dataset import hold_out_validation
 from wbgs_jax.data.scene_file import save_scene
-from wbgs_jax.data.splits import hold_out_validation
 
 LOGS = np.log10([1e9, 2.4e9, 10e9, 28e9, 60e9, 94e9])
 

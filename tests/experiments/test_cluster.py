@@ -11,10 +11,10 @@ import time
 import cloudpickle
 import pytest
 
+from data_gen import cluster
 from experiments import runner
 from experiments.jobs import Job
 from experiments.results import Results
-from wbgs_jax._util import dask_cluster
 from wbgs_jax._util.errors import UserError
 
 cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers cannot import tests
@@ -44,15 +44,13 @@ def killed_once(number, folder):
 
 @pytest.mark.heavy
 def test_a_killed_worker_loses_nothing_and_an_error_stops_no_other(tmp_path):
-    with dask_cluster.connected("local", 2) as client:
-        found = {
-            task: (said, str(error)) for task, said, error in dask_cluster.finished(client, killed_once, range(4), tmp_path)
-        }
+    with cluster.connected("local", 2) as client:
+        found = {task: (said, str(error)) for task, said, error in cluster.finished(client, killed_once, range(4), tmp_path)}
         assert found == {0: (0, "None"), 1: (1, "None"), 2: (None, "as it should be"), 3: (9, "None")}
         assert (tmp_path / "1").exists()
         begin = time.monotonic()
         with pytest.raises(TimeoutError):
-            list(dask_cluster.finished(client, time.sleep, [20, 20, 20], seconds=0.5))
+            list(cluster.finished(client, time.sleep, [20, 20, 20], seconds=0.5))
         assert time.monotonic() - begin < 10
 
 
@@ -74,14 +72,14 @@ def test_a_cluster_has_the_results_of_a_serial_run(command, tmp_path, capsys):
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense"])
 def test_a_scheduler_that_is_not_there_is_one_line(address, monkeypatch):
-    monkeypatch.setattr(dask_cluster, "CONNECT_S", "300ms")
-    with pytest.raises(UserError, match="no Dask scheduler answers at"), dask_cluster.connected(address, 1):
+    monkeypatch.setattr(cluster, "CONNECT_S", "300ms")
+    with pytest.raises(UserError, match="no Dask scheduler answers at"), cluster.connected(address, 1):
         pass
 
 
 def test_without_dask_the_message_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(UserError, match=r"pip install 'wbgs-jax\[cluster\]'"), dask_cluster.connected("local", 1):
+    with pytest.raises(UserError, match=r"pip install 'wbgs-jax\[cluster\]'"), cluster.connected("local", 1):
         pass
 
 

@@ -5,7 +5,7 @@ from builders.synthetic import tiny_dataset
 
 from experiments.studies import decisions_account as account
 from experiments.studies.decisions_account import decisions, simulate, stored_gains, transmitters
-from wbgs_jax.data.splits import hold_out_validation
+from wbgs_jax.data.dataset import hold_out_validation
 
 
 def test_every_decision_names_what_stands_without_evidence_and_counts_transmitters():

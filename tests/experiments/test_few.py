@@ -10,7 +10,7 @@ from experiments.few import SIMPLE, along_a_track, below, cases, coverage, data_
 from experiments.results import FOLDER, Results, add_rows
 from experiments.tables import few as table
 from wbgs_jax.data import load_dataset
-from wbgs_jax.data.splits import training_links
+from wbgs_jax.data.dataset import training_links
 
 
 def row(case="rfid_32", seed=0, score=0.8, best=0.81, level=0.9, held=1.0, tested=8):

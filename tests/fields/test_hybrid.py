@@ -9,7 +9,7 @@ import pytest
 from builders.synthetic import tiny_dataset, tiny_settings
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.splits import hold_out_validation
+from wbgs_jax.data.dataset import hold_out_validation
 from wbgs_jax.fields import get_field
 from wbgs_jax.fields import mixture as noise
 from wbgs_jax.fields.base import outputs_of, paths_of
@@ -27,9 +27,8 @@ from wbgs_jax.fields.mixture import (
 from wbgs_jax.inference.predictor import observe_links
 from wbgs_jax.inference.trained_field import RunConfig
 from wbgs_jax.radio.array import snapshot_to_pas
-from wbgs_jax.training import expert_weights
-from wbgs_jax.training.expert_weights import ExpertWeights, Seen
-from wbgs_jax.training.hooks import Context, probe_of
+from wbgs_jax.training import hooks
+from wbgs_jax.training.hooks import Context, ExpertWeights, Seen, probe_of
 from wbgs_jax.training.loop import Run, train
 from wbgs_jax.training.run_folder import load_trained, prepare_folder
 
@@ -148,7 +147,7 @@ def test_noise_does_not_speak_against_the_coherent_field_and_is_not_said(run, rn
         assert float(given.trust.floor) == 0  # or it would be found in what is left of it
         return said
 
-    monkeypatch.setattr(expert_weights, "expert_predictions_of", opinions_without_floor)
+    monkeypatch.setattr(hooks, "expert_predictions_of", opinions_without_floor)
     monkeypatch.setattr(noise, "FEWEST_TX", 5)
     found, report = weighted(run, params, [batch])
     assert report["noise_floor"] == pytest.approx(float(found.trust.floor))
@@ -156,7 +155,7 @@ def test_noise_does_not_speak_against_the_coherent_field_and_is_not_said(run, rn
     assert float(run.field.as_observed(found, jnp.zeros((1, 90, 360))).min()) > 0.03
     again, _ = weighted(run, found, [batch])
     assert float(again.trust.floor) == float(found.trust.floor)
-    monkeypatch.setattr(expert_weights, "floor_of", lambda *_: 0.0)
+    monkeypatch.setattr(hooks, "floor_of", lambda *_: 0.0)
     without, _ = weighted(run, params, [batch])
     trusted, less = (report_of(p, said.features)["coherent"] for p in (found, without))
     assert trusted > less + 0.1  # the splatting one is as right here, but for the noise

@@ -8,8 +8,8 @@ import pytest
 from builders.synthetic import FIELDS, tiny_dataset, tiny_settings
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.dataset import select_frequencies
 from wbgs_jax.data.scene import DatasetScene
-from wbgs_jax.data.splits import select_frequencies
 from wbgs_jax.fields import Field, get_field
 from wbgs_jax.fields.wideband import WidebandField
 from wbgs_jax.fields.wrfgs import WrfgsConfig, WrfgsField, without_frequency

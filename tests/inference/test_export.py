@@ -19,8 +19,8 @@ from builders.untrained import STEP, make_field, make_params, make_run, make_tra
 import wbgs_jax
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
+from wbgs_jax.data.dataset import hold_out_validation
 from wbgs_jax.data.scene import DatasetScene
-from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.fields import get_field
 from wbgs_jax.fields.coherent import WaveConfig
 from wbgs_jax.fields.hybrid import HybridConfig

@@ -11,8 +11,7 @@ from builders.wave_runs import PARTS, RX, places, run_in
 
 from wbgs_jax._util.files import write_csv
 from wbgs_jax.data.tables import read_table
-from wbgs_jax.inference.evaluate_quantities import LoadedField, mimo_matrices, predict_gains, predict_paths
-from wbgs_jax.inference.path_table import SIGHT
+from wbgs_jax.inference.evaluate_quantities import SIGHT, LoadedField, mimo_matrices, predict_gains, predict_paths
 from wbgs_jax.inference.predictor import observe_queries
 from wbgs_jax.inference.quantities import Options
 from wbgs_jax.inference.results_file import Answers, table_rows

@@ -10,7 +10,7 @@ from builders.synthetic import RX, tiny_dataset
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.statistics import standard_error
-from wbgs_jax.data.splits import hold_out_validation
+from wbgs_jax.data.dataset import hold_out_validation
 from wbgs_jax.inference import kriging
 from wbgs_jax.inference.kriging import NEAREST, NOISE, correct, for_receiver, read_neighbours, write_neighbours
 from wbgs_jax.training.fit_kriging import Choice, choices, images_of, make_neighbours

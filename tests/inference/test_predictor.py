@@ -14,8 +14,7 @@ from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import get_field
 from wbgs_jax.fields.base import portable
 from wbgs_jax.inference import predictor as inference
-from wbgs_jax.inference.batching import map_queries, predict_blocks, predict_many, predict_map
-from wbgs_jax.inference.predictor import make_predictor
+from wbgs_jax.inference.predictor import make_predictor, map_queries, predict_blocks, predict_many, predict_map
 from wbgs_jax.inference.trained_field import at_receiver, receiver_number
 from wbgs_jax.radio.antenna import Pattern
 from wbgs_jax.splat import TileLimits

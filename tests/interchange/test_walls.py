@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from wbgs_jax.data.scene import _obstructed
-from wbgs_jax.mesh.polygons import triangulate
+from wbgs_jax.mesh.bodies import triangulate
 from wbgs_jax.mesh.walls import divided, hidden_walls, walls_as_sheets
 
 

@@ -13,8 +13,7 @@ from builders.flats import LAW, RECEIVERS, WALL, places, powers, walls_between
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.floor_plan import NO_WALLS, Walls
 from wbgs_jax.data.rssi_folder import Readings
-from wbgs_jax.power_map.model import MAX_PLACES, find_ceilings, learn_map, received_power
-from wbgs_jax.power_map.scales import LENGTH, Scales, noise
+from wbgs_jax.power_map.model import LENGTH, MAX_PLACES, Scales, find_ceilings, learn_map, noise, received_power
 from wbgs_jax.power_map.validation import (
     FOLDS,
     NINETY,

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wbgs_jax.propagation.absorption import SAMPLES, Grid, attenuation, grid_around, smoothed
+from wbgs_jax.propagation.transport import SAMPLES, Grid, attenuation, grid_around, smoothed
 
 SHAPE, CELL = (7, 5, 4), 0.5
 LOW = np.array([-1.0, 0.5, 0.0])

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from builders.rooms import box, facets_of, room, search_of, trace
 
-from wbgs_jax._util.bits import WORD, first_of
 from wbgs_jax._util.pytree import to_device
 from wbgs_jax.mesh.facets import Facets, half_planes_of
 from wbgs_jax.propagation import paths as paths_module
@@ -18,10 +17,12 @@ from wbgs_jax.propagation.occlusion import (
     FEW_BLOCKS,
     LEAF,
     NEAR,
+    WORD,
     Crossings,
     crossed,
     crossing_share,
     crossings,
+    first_of,
     hierarchy_of,
     listed,
     planes_of,

@@ -7,10 +7,15 @@ import pytest
 from builders.mirrors import trained
 from builders.rooms import METAL, field_of, rectangle
 
-from wbgs_jax.applications.antenna_placement import mean_power, power_at_users, soft_minimum, tenth_percentile
-from wbgs_jax.applications.array_orientation import boresight_quaternion
+from wbgs_jax.applications.antenna_placement import (
+    boresight_quaternion,
+    mean_power,
+    power_at_users,
+    soft_minimum,
+    tenth_percentile,
+)
 from wbgs_jax.radio.antenna import Antenna, pattern_exponents
-from wbgs_jax.radio.network import BOLTZMANN, noise_dbm, sinr_db, throughput_bps
+from wbgs_jax.radio.channel import BOLTZMANN, noise_dbm, sinr_db, throughput_bps
 from wbgs_jax.types import Transmitter
 
 HZ = 2.4e9

@@ -11,7 +11,7 @@ from builders.toys import NoisyField, RippleConfig, RippleField
 from builders.untrained import make_field, make_params
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.splits import hold_out_validation
+from wbgs_jax.data.dataset import hold_out_validation
 from wbgs_jax.evaluation.score import calibrate_power, calibration, expectations, power_calibration
 from wbgs_jax.inference.intervals import (
     FILE,

@@ -9,7 +9,7 @@ import pytest
 from builders.synthetic import tiny_dataset
 from builders.toys import RippleConfig, RippleField, toy_settings
 
-from wbgs_jax.data.splits import hold_out_validation, training_links
+from wbgs_jax.data.dataset import hold_out_validation, training_links
 from wbgs_jax.training import cross_validation
 from wbgs_jax.training.cross_validation import FOLDS, Training, blocks, held_out_blocks, is_few, learn_few, shortened
 from wbgs_jax.training.fit_mixture import Found, start_mixture

@@ -10,7 +10,7 @@ import pytest
 from builders.synthetic import tiny_dataset
 
 from wbgs_jax._util.statistics import lower_bound
-from wbgs_jax.data.splits import fewer_transmitters, hold_out_validation, keep_links, training_links
+from wbgs_jax.data.dataset import fewer_transmitters, hold_out_validation, keep_links, training_links
 from wbgs_jax.fields.mixture import SHARES
 from wbgs_jax.inference.kriging import mixed_spectra
 from wbgs_jax.metrics import ssim

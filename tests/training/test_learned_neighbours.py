@@ -9,7 +9,7 @@ import pytest
 from builders.synthetic import tiny_dataset
 from builders.toys import NoisyField, RippleConfig, RippleField
 
-from wbgs_jax.data.splits import hold_out_validation, keep_links
+from wbgs_jax.data.dataset import hold_out_validation, keep_links
 from wbgs_jax.inference.kriging import correct
 from wbgs_jax.metrics import ssim
 from wbgs_jax.training import fit_kriging as module

@@ -14,8 +14,8 @@ from builders.synthetic import tiny_dataset, tiny_settings
 from builders.toys import GROWING, metrics_of, toy_settings
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.dataset import hold_out_validation
 from wbgs_jax.data.scene import DatasetScene
-from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.evaluation.score import watch
 from wbgs_jax.fields import get_field
 from wbgs_jax.fields.wideband import WidebandField

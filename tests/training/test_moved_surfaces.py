@@ -15,9 +15,8 @@ from wbgs_jax.fields import coherent
 from wbgs_jax.training.calibration import alignment, pipeline
 from wbgs_jax.training.calibration.alignment import GeometryReport, Place, frequencies_apart, learn_geometry
 from wbgs_jax.training.calibration.antennas import AntennaReport, antenna_candidates
-from wbgs_jax.training.calibration.objective import make_scores
-from wbgs_jax.training.calibration.thickness import Slab
-from wbgs_jax.training.calibration.uncertainty import SPREADS_M, search_placement
+from wbgs_jax.training.calibration.material_fit import Slab
+from wbgs_jax.training.calibration.objective import SPREADS_M, make_scores, search_placement
 from wbgs_jax.training.hooks import silent
 from wbgs_jax.types import make_query
 

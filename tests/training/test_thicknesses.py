@@ -9,9 +9,19 @@ import pytest
 from builders.synthetic import tiny_settings
 from builders.wave_runs import PARTS, places, run_in, snapshots
 
-from wbgs_jax.training.calibration.material_fit import ITU_MATERIALS, USUAL_M, SearchReport, search_materials
+from wbgs_jax.training.calibration.material_fit import (
+    ITU_MATERIALS,
+    ONCE_MORE,
+    USUAL_M,
+    SearchReport,
+    Slab,
+    _all_slabs,
+    _best,
+    frequencies_to_look_at,
+    search_materials,
+    search_slabs,
+)
 from wbgs_jax.training.calibration.objective import CalibrationProblem
-from wbgs_jax.training.calibration.thickness import ONCE_MORE, Slab, _all_slabs, _best, frequencies_to_look_at, search_slabs
 
 N_TX, FREQUENCIES = 40, np.array([1e9, 2.4e9, 5e9, 12e9, 28e9])
 SETTINGS = tiny_settings(
@@ -113,8 +123,9 @@ def test_pictures_alone_are_not_asked(room, rng, monkeypatch):
     heard = problem(room, of(start, ["wood"] * len(PARTS), rng.uniform(0.01, 0.3, len(PARTS))))
     heard = dataclasses.replace(heard, data=heard.data.with_observations())
     nothing = SearchReport(0.0, 0.0, {})
-    monkeypatch.setattr("wbgs_jax.training.calibration.thickness.search_materials", lambda params, *_, **__: (params, nothing))
-    monkeypatch.setattr("wbgs_jax.training.calibration.thickness._sized", lambda *_: pytest.fail("searched"))
+    module = "wbgs_jax.training.calibration.material_fit"
+    monkeypatch.setattr(f"{module}.search_materials", lambda params, *_, **__: (params, nothing))
+    monkeypatch.setattr(f"{module}._sized", lambda *_: pytest.fail("searched"))
     found, report, _ = search_slabs(start, heard, SETTINGS.calibration, 60)
     assert found is start and report is nothing
 

@@ -10,7 +10,7 @@ from builders.synthetic import tiny_settings
 from builders.wave_runs import PARTS, REFLECTIONS, places, run_in
 
 from wbgs_jax.fields import coherent
-from wbgs_jax.training.calibration.array_gains import least_squares, search_tuning
+from wbgs_jax.training.calibration.antennas import least_squares, search_tuning
 from wbgs_jax.training.calibration.objective import CalibrationProblem
 from wbgs_jax.types import make_query
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from wbgs_jax._util.bits import WORD, in_chunks, located, members, packed
+from wbgs_jax.propagation.occlusion import WORD, in_chunks, located, members, packed
 
 
 def test_members_come_in_order_with_their_places(rng):

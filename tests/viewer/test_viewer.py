@@ -20,7 +20,7 @@ from wbgs_jax.inference.predictor import make_predictor
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, pas_directions
 from wbgs_jax.training.run_folder import load_trained
 from wbgs_jax.types import make_receiver
-from wbgs_jax.viewer import drawing, figures, panel, session, walk
+from wbgs_jax.viewer import figures, panel, session
 from wbgs_jax.viewer.app import Latest
 from wbgs_jax.viewer.page import Page
 from wbgs_jax.viewer.session import LinkBudget, Session
@@ -156,7 +156,7 @@ def test_a_dome_is_brightest_where_the_spectrum_is(rng):
     row, column = 32, 60  # multiples of the stride
     pas[row, column] = 1
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    points, colors = drawing.dome(pas, turn, 2.0)
+    points, colors = figures.dome(pas, turn, 2.0)
     brightest = int(np.argmax(np.linalg.norm(points, axis=1)))
     np.testing.assert_allclose(points[brightest], 2.0 * turn @ pas_directions()[row, column], atol=1e-5)
     assert colors[brightest].sum() > colors[0].sum()
@@ -165,8 +165,8 @@ def test_a_dome_is_brightest_where_the_spectrum_is(rng):
 def test_pictures_of_maps_are_clear_where_nothing_is_received(rng):
     values = rng.uniform(-90, -50, (4, 6))
     values[0, 0] = np.nan
-    low, high = drawing.map_range(values)
-    picture, dim = drawing.map_picture(values, low, high), drawing.map_picture(values, low, high, dim=True)
+    low, high = figures.map_range(values)
+    picture, dim = figures.map_picture(values, low, high), figures.map_picture(values, low, high, dim=True)
     assert picture.shape == (4, 6, 4) and picture[-1, 0, 3] == 0 and picture[0, 0, 3] > dim[0, 0, 3] > 0  # largest y on top
     assert -91 < low < high < -49
 
@@ -174,7 +174,7 @@ def test_pictures_of_maps_are_clear_where_nothing_is_received(rng):
 def test_weak_paths_fade_and_paths_without_power_are_not_listed(coherent, monkeypatch):
     power = np.array([-60.0, -99.0, -110.0, -130.0])
     for by_power in (True, False):
-        colors = drawing.path_colors(power, np.zeros(4, int), by_power).astype(int)
+        colors = figures.path_colors(power, np.zeros(4, int), by_power).astype(int)
         away = np.linalg.norm(colors - 255, axis=1)
         assert away[1] > 2 * away[3] and away[2] > away[3]
     count = len(coherent.predict(PLACE, HZ).paths.power_db)
@@ -320,16 +320,16 @@ def test_words_of_a_map_name_what_it_is_of():
 
 def test_path_segments_leave_out_what_is_filled_up():
     points = np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0], [1, 1, 0], [1, 1, 0.0]]])
-    segments, ends = drawing.path_segments(points, np.array([[1, 2, 3]], np.uint8))
+    segments, ends = figures.path_segments(points, np.array([[1, 2, 3]], np.uint8))
     assert segments.shape == ends.shape == (2, 2, 3)
-    np.testing.assert_array_equal(drawing.path_handles(points), [[1, 0, 0]])
+    np.testing.assert_array_equal(figures.path_handles(points), [[1, 0, 0]])
 
 
 def test_a_walk_is_as_long_as_its_way_and_closed(rng):
-    way = walk.stops(rng.normal(size=(30, 3)))
+    way = session.stops_of_walk(rng.normal(size=(30, 3)))
     total = np.linalg.norm(np.diff(np.concatenate([way, way[:1]]), axis=0), axis=1).sum()
-    np.testing.assert_allclose(walk.place_on(way, 0.3), walk.place_on(way, total + 0.3), atol=1e-9)
-    steps = np.array([walk.place_on(way, s) for s in np.linspace(0, total, 2001)])
+    np.testing.assert_allclose(session.place_on_walk(way, 0.3), session.place_on_walk(way, total + 0.3), atol=1e-9)
+    steps = np.array([session.place_on_walk(way, s) for s in np.linspace(0, total, 2001)])
     assert np.linalg.norm(np.diff(steps, axis=0), axis=1).max() <= total / 2000 * (1 + 1e-6)
 
 

@@ -1,12 +1,12 @@
+from .antenna_placement import boresight_quaternion as boresight_quaternion
 from .antenna_placement import mean_power as mean_power
 from .antenna_placement import place_antenna as place_antenna
 from .antenna_placement import power_at_users as power_at_users
+from .antenna_placement import power_when_rotated as power_when_rotated
+from .antenna_placement import predict_isotropic_paths as predict_isotropic_paths
+from .antenna_placement import rotate_array as rotate_array
 from .antenna_placement import soft_minimum as soft_minimum
 from .antenna_placement import tenth_percentile as tenth_percentile
-from .array_orientation import boresight_quaternion as boresight_quaternion
-from .array_orientation import power_when_rotated as power_when_rotated
-from .array_orientation import predict_isotropic_paths as predict_isotropic_paths
-from .array_orientation import rotate_array as rotate_array
 from .beams import choose_beams as choose_beams
 from .beams import rank_beams as rank_beams
 from .beams import score_beams as score_beams

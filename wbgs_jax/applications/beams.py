@@ -5,8 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from wbgs_jax.inference.batching import predict_many
-from wbgs_jax.inference.predictor import Predictor
+from wbgs_jax.inference.predictor import Predictor, predict_many
 from wbgs_jax.metrics import beam_loss_db
 from wbgs_jax.radio.array import ALIKE, codebook, pas_directions
 

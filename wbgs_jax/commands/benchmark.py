@@ -86,7 +86,7 @@ def write_queries(folder: Path, scenes: tuple[str, ...]) -> None:
 
 def score_scene(path: Path, dataset: "Dataset") -> dict[str, Any]:
     """Returns the report of a file of predictions for the test links of a scene, as `wbgs-jax eval` reports a run."""
-    from wbgs_jax.data.splits import with_validation_trained
+    from wbgs_jax.data.dataset import with_validation_trained
     from wbgs_jax.evaluation.score import power_figures, score_snapshots, score_spectra
 
     index, reference = dataset.test, with_validation_trained(dataset)

@@ -36,8 +36,7 @@ from wbgs_jax.data.tables import check_positions
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.inference.domain import Domain
 from wbgs_jax.plotting import draw_power_maps, save
-from wbgs_jax.power_map.model import PowerMap, learn_map, received_power
-from wbgs_jax.power_map.scales import Scales
+from wbgs_jax.power_map.model import PowerMap, Scales, learn_map, received_power
 from wbgs_jax.power_map.survey import find_walls, load_survey
 from wbgs_jax.power_map.validation import COMPARED, NINETY, Score, scores
 

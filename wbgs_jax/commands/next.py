@@ -136,8 +136,8 @@ def of_readings(command: Command, places: Float[np.ndarray, "c 3"]) -> State:
     import jax.numpy as jnp
 
     from wbgs_jax._util.pytree import map_blocks
+    from wbgs_jax.power_map.model import LENGTH as ALIKE_M
     from wbgs_jax.power_map.model import learn_map, received_power
-    from wbgs_jax.power_map.scales import LENGTH as ALIKE_M
     from wbgs_jax.power_map.survey import load_survey
 
     assert command.data is not None, "checked"

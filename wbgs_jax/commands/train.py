@@ -25,9 +25,8 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.progress_lines import Pulse
 from wbgs_jax.config import Settings, check, from_sections, present_option, sections
 from wbgs_jax.data.conventions import ConventionName
-from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.dataset import VALIDATION, Dataset
 from wbgs_jax.data.load import released_scenes, source_names
-from wbgs_jax.data.splits import VALIDATION
 from wbgs_jax.fields import default_field, field_names, get_field
 from wbgs_jax.fields.base import check_config
 from wbgs_jax.inference.intervals import write_confidence

@@ -45,10 +45,9 @@ from wbgs_jax.data.conventions import (
     turned,
     unrelated,
 )
-from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.dataset import Dataset, group_places, group_transmitters, note_shared_transmitters, tx_disjoint_split
 from wbgs_jax.data.load import check_surroundings, materials_of, scene_dataset
 from wbgs_jax.data.scene_file import Room, SceneFile, check_mesh, load_room
-from wbgs_jax.data.splits import group_places, group_transmitters, note_shared_transmitters, tx_disjoint_split
 from wbgs_jax.mesh.bodies import share_in_box
 from wbgs_jax.mesh.ply import read_ply, write_ply
 from wbgs_jax.observation_kinds import KINDS

@@ -11,8 +11,8 @@ from rich.table import Table
 
 import wbgs_jax
 from wbgs_jax.config import to_dict
+from wbgs_jax.data.dataset import VALIDATION
 from wbgs_jax.data.load import source_names
-from wbgs_jax.data.splits import VALIDATION
 from wbgs_jax.inference.trained_field import RunConfig, TrainedField
 
 

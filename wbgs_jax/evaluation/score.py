@@ -26,10 +26,9 @@ from wbgs_jax import metrics
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_json
 from wbgs_jax._util.progress_lines import CountProgress, Pulse
-from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.dataset import Dataset, with_validation_trained
 from wbgs_jax.data.load import RELEASED
 from wbgs_jax.data.scene import in_sight
-from wbgs_jax.data.splits import with_validation_trained
 from wbgs_jax.evaluation.baselines import baselines, can_lend, nearest_links
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.fields.base import Params

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Key
 
 from wbgs_jax.fields.base import Field, MaterialProperties, Params
-from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams, WavePlan, element_gains
-from wbgs_jax.fields.coherent_settings import WaveConfig
+from wbgs_jax.fields.coherent_model import PreparedPaths, WaveConfig, WaveParams, WavePlan, element_gains
 from wbgs_jax.mesh.facets import AnyArray, Facets
 from wbgs_jax.propagation.displacement import Motion
 from wbgs_jax.types import Links, Receiver

@@ -32,8 +32,10 @@ from wbgs_jax.fields.base import (
 )
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import (
+    PRESETS,
     Materials,
     PreparedPaths,
+    WaveConfig,
     WaveParams,
     WavePlan,
     arrivals_at,
@@ -49,16 +51,14 @@ from wbgs_jax.fields.coherent_model import (
     trace,
     transparent_grid,
 )
-from wbgs_jax.fields.coherent_settings import PRESETS, WaveConfig
 from wbgs_jax.fields.losses import snapshot_losses
 from wbgs_jax.mesh.edges import Edges, common_size, edges_of_facets, padded_edges, padded_to
 from wbgs_jax.mesh.facets import AnyArray, Facets, remaining
 from wbgs_jax.mesh.facets import moved as move_facets
 from wbgs_jax.mesh.simplification import facets_that_fit
-from wbgs_jax.propagation.absorption import Grid, grid_around
-from wbgs_jax.propagation.displacement import Motion, still
+from wbgs_jax.propagation.displacement import Motion, still, tree_over_time
 from wbgs_jax.propagation.image_method import ImageTree, make_image_tree
-from wbgs_jax.propagation.moving_tree import tree_over_time
+from wbgs_jax.propagation.transport import Grid, grid_around
 from wbgs_jax.radio.antenna import upright
 from wbgs_jax.radio.array import LagBasis, make_lag_basis
 from wbgs_jax.radio.channel import Paths

@@ -46,7 +46,7 @@ from wbgs_jax.fields.em_features import (
 )
 from wbgs_jax.fields.networks import positional_encoding
 from wbgs_jax.fields.wideband_settings import CONFIGS, DENSITY, OPTIM, PAPER, WidebandConfig
-from wbgs_jax.splat.render import GeometryPlan, geometry_plan, render_splats
+from wbgs_jax.splat.composite import GeometryPlan, geometry_plan, render_splats
 from wbgs_jax.splat.tiles import TileLimits, fit_limits, slots_for
 from wbgs_jax.types import (
     Batch,

@@ -13,8 +13,8 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.inference.evaluate_quantities import LoadedField
 from wbgs_jax.inference.quantities import Network
 from wbgs_jax.radio.array import codebook, pas_directions
+from wbgs_jax.radio.channel import noise_dbm, sinr_db, throughput_bps
 from wbgs_jax.radio.geometry import direction_to_angles
-from wbgs_jax.radio.network import noise_dbm, sinr_db, throughput_bps
 
 
 @dataclass(frozen=True)

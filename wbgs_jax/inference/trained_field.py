@@ -11,17 +11,18 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.public_names import warn_renamed
 from wbgs_jax.config import Settings
 from wbgs_jax.data.conventions import ConventionName
-from wbgs_jax.data.dataset import Dataset, check_data
-from wbgs_jax.data.image_folder import records_frequency
-from wbgs_jax.data.load import load_dataset, source_names, source_paths
-from wbgs_jax.data.splits import (
+from wbgs_jax.data.dataset import (
     VALIDATION,
+    Dataset,
+    check_data,
     fewer_transmitters,
     hold_out_box,
     hold_out_validation,
     select_receivers,
     unseen_frequencies,
 )
+from wbgs_jax.data.image_folder import records_frequency
+from wbgs_jax.data.load import load_dataset, source_names, source_paths
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.intervals import Confidence, PowerConfidence

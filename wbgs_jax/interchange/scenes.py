@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Complex, Float, Inexact
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.dataset import group_places, group_transmitters, tx_disjoint_split
 from wbgs_jax.data.scene_file import TEST, TRAIN, Room, SceneFile
-from wbgs_jax.data.splits import group_places, group_transmitters, tx_disjoint_split
 from wbgs_jax.interchange.ray_paths import RayPaths, carrier, directions_of
 
 FEWEST = 5

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, Num
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
-from wbgs_jax.mesh.polygons import triangulate
+from wbgs_jax.mesh.bodies import triangulate
 
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"},

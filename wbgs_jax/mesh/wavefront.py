@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.mesh.bodies import Body
-from wbgs_jax.mesh.polygons import triangulate
+from wbgs_jax.mesh.bodies import Body, triangulate
 
 CURVED = {"curv", "curv2", "surf", "bzp", "bsp", "cdc", "cdp"}
 """Statements that define curves and curved surfaces."""

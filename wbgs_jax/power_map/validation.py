@@ -24,13 +24,18 @@ from wbgs_jax.power_map.model import (
     APART,
     MIN_POWERS,
     NEAREST,
+    Scales,
+    alike,
     covariance_of_powers,
+    distances,
     find_ceilings,
     fit_law,
+    in_one_room,
     law_features,
+    learn_scales,
+    noise,
     residuals,
 )
-from wbgs_jax.power_map.scales import Scales, alike, distances, in_one_room, learn_scales, noise
 
 BLOCK, FOLDS = 1.0, 40
 """Side of the held-out squares, metres; and the maximum number of folds, into which several squares are combined."""

@@ -18,12 +18,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from wbgs_jax._util.bits import WORD, in_chunks, members, packed
 from wbgs_jax._util.pytree import AnyArray, pytree, static, with_leaves
 from wbgs_jax.mesh.edges import Edges, about_edges
 from wbgs_jax.mesh.facets import CORNERS, Facets, HalfPlanes
 from wbgs_jax.propagation.image_method import GROUP, ImageTree, ReflectionSequences
-from wbgs_jax.propagation.occlusion import NEAR, crossing_share, crossings, listed
+from wbgs_jax.propagation.occlusion import NEAR, WORD, crossing_share, crossings, in_chunks, listed, members, packed
 from wbgs_jax.radio.array import EXACT
 
 MAX_ORDER = 3

@@ -14,7 +14,7 @@ from .channel import delay_spread_s as delay_spread_s
 from .channel import doppler_hz as doppler_hz
 from .channel import free_space_db as free_space_db
 from .channel import k_factor_db as k_factor_db
+from .channel import noise_dbm as noise_dbm
 from .channel import received_power_db as received_power_db
-from .network import noise_dbm as noise_dbm
-from .network import sinr_db as sinr_db
-from .network import throughput_bps as throughput_bps
+from .channel import sinr_db as sinr_db
+from .channel import throughput_bps as throughput_bps

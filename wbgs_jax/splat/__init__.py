@@ -1,6 +1,6 @@
-"""Splatting onto the receiver's hemisphere: projection.py -> tiles.py -> composite.py, composed by render.py.
+"""Splatting onto the receiver's hemisphere: projection.py -> tiles.py -> composite.py.
 
-`render.render_dense` is a dense, readable reference implementation of the same image.
+`composite.render_dense` is a dense, readable reference implementation of the same image.
 """
 
 from wbgs_jax._util.public_names import attach

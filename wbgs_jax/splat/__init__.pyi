@@ -1,9 +1,9 @@
 from ..types import Gaussians as Gaussians
+from .composite import GeometryPlan as GeometryPlan
+from .composite import geometry_plan as geometry_plan
+from .composite import measure_limits as measure_limits
+from .composite import render_dense as render_dense
+from .composite import render_splats as render_splats
 from .projection import Splats as Splats
 from .projection import project as project
-from .render import GeometryPlan as GeometryPlan
-from .render import geometry_plan as geometry_plan
-from .render import measure_limits as measure_limits
-from .render import render_dense as render_dense
-from .render import render_splats as render_splats
 from .tiles import TileLimits as TileLimits

@@ -23,8 +23,7 @@ from jaxtyping import Bool, Float, Int
 
 from wbgs_jax._util.files import atomic_write, read_arrays
 from wbgs_jax.config import Settings
-from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.splits import VALIDATION, places_of, training_links
+from wbgs_jax.data.dataset import VALIDATION, Dataset, places_of, training_links
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.intervals import Confidence, features

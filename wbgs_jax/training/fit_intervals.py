@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from wbgs_jax._util.statistics import standard_error
-from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.splits import places_of
+from wbgs_jax.data.dataset import Dataset, places_of
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.intervals import (

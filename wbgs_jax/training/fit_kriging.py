@@ -16,8 +16,7 @@ from jaxtyping import Array, Float, Int, Num, UInt8
 from scipy.spatial import cKDTree
 
 from wbgs_jax._util.statistics import standard_error
-from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.splits import places_of, training_links
+from wbgs_jax.data.dataset import Dataset, places_of, training_links
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.kriging import SAME_FREQUENCY, Neighbours

@@ -28,9 +28,8 @@ from wbgs_jax._util.devices import any_process, by_first, check_alike, devices_f
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.progress_lines import Pulse
 from wbgs_jax.config import Settings
-from wbgs_jax.data.dataset import Dataset, check_checksum, checksum
+from wbgs_jax.data.dataset import Dataset, check_checksum, checksum, training_links, without_test
 from wbgs_jax.data.scene import DatasetScene
-from wbgs_jax.data.splits import training_links, without_test
 from wbgs_jax.evaluation.score import watch
 from wbgs_jax.fields import Field, get_field
 from wbgs_jax.fields.base import Params, field_from_arrays
@@ -38,8 +37,7 @@ from wbgs_jax.training import checkpoint, curves
 from wbgs_jax.training.batches import check_data, data_with_virtual, limited, with_virtual_drawn
 from wbgs_jax.training.calibration.pipeline import Calibration
 from wbgs_jax.training.density import DensityControl
-from wbgs_jax.training.expert_weights import ExpertWeights
-from wbgs_jax.training.hooks import Context, Edit, Hook, OfPart, Say, map_moments, silent
+from wbgs_jax.training.hooks import Context, Edit, ExpertWeights, Hook, OfPart, Say, map_moments, silent
 from wbgs_jax.training.progress import Interrupted, TrainingProgress, deferred_interrupt
 from wbgs_jax.training.step import EpochReport, TrainState, init_state, make_optimizer, run_epoch
 from wbgs_jax.types import Batch

@@ -21,10 +21,9 @@ from scipy.spatial import cKDTree
 from wbgs_jax._util.cli import point_words
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import write_json
-from wbgs_jax.data.dataset import Dataset, checksum
+from wbgs_jax.data.dataset import Dataset, checksum, keep_links, places_of, training_links
 from wbgs_jax.data.load import PARTS, source_paths
 from wbgs_jax.data.scene_file import SceneFile, load_scene, save_scene
-from wbgs_jax.data.splits import keep_links, places_of, training_links
 from wbgs_jax.fields.base import Ability
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import WaveParams

@@ -18,9 +18,9 @@ from wbgs_jax._util.cli import say
 from wbgs_jax._util.files import atomic_write
 from wbgs_jax.inference.radio_map import Plane, cut_at, plane_over
 from wbgs_jax.types import Receiver
-from wbgs_jax.viewer import drawing, figures, panel, walk
+from wbgs_jax.viewer import figures, panel
 from wbgs_jax.viewer.page import Page, as_words
-from wbgs_jax.viewer.session import Answer, Session
+from wbgs_jax.viewer.session import Answer, Session, place_on_walk, stops_of_walk
 from wbgs_jax.viewer.surroundings import FIELD_OF_VIEW, SceneView
 
 
@@ -103,7 +103,7 @@ class Viewer:
         self.map: DrawnMap | None = None
         self._clicked: tuple[float, float] | None = None
         self._receiver = session.receiver
-        self._way, self._walked, self._syncing = walk.stops(data.tx_positions), 0.0, threading.local()
+        self._way, self._walked, self._syncing = stops_of_walk(data.tx_positions), 0.0, threading.local()
         # Actions of controls run in threads of their own: the last change of the session is that of the newest value, ...
         self._changing = threading.Lock()
         # ... and the newest map is the one that is drawn.
@@ -375,7 +375,7 @@ class Viewer:
             return
         budget, plane, outdated = self.controls.budget, drawn.plane, drawn.conditions != self.map_conditions
         values = budget.received_dbm(drawn.values)
-        span = drawing.map_range(values)
+        span = figures.map_range(values)
         self.view.draw_map(values, plane, span, outdated, self._click_map)
         steps = [(axis[1] - axis[0]) / 2 if len(axis) > 1 else 0.5 for axis in (plane.xs, plane.ys)]
         x, y = (
@@ -444,4 +444,4 @@ class Viewer:
             time.sleep(1 / steps_a_second)
             if self.controls.play.value:
                 self._walked += float(self.controls.speed.value) / steps_a_second
-                self.move(walk.place_on(self._way, self._walked))
+                self.move(place_on_walk(self._way, self._walked))

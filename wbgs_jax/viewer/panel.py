@@ -12,7 +12,7 @@ from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.inference.evaluate_quantities import lowest_frequency
 from wbgs_jax.inference.trained_field import receiver_number
 from wbgs_jax.types import MAX_FREQUENCY_HZ
-from wbgs_jax.viewer import drawing, figures
+from wbgs_jax.viewer import figures
 from wbgs_jax.viewer.page import as_words
 from wbgs_jax.viewer.session import Answer, LinkBudget, PathList, Sample, Session
 
@@ -292,7 +292,7 @@ def channel_figures(paths: PathList | None, budget: LinkBudget, band_mhz: float)
 def gaussian_legend(top: float, by: str) -> str:
     """Returns the colour bar of the Gaussians, which are coloured by "signal" or "attenuation" from 0 to `top`."""
     label = "signal towards the receiver, amplitude" if by == "signal" else "share of a wave that is attenuated"
-    bar = figures.legend(figures.axis_over(0.0, top, label), drawing.GAUSSIAN_COLORS)
+    bar = figures.legend(figures.axis_over(0.0, top, label), figures.GAUSSIAN_COLORS)
     return f'<div class="wbgs-panel">{bar}</div>'
 
 
@@ -303,8 +303,8 @@ def path_list(paths: PathList | None, count: int, chosen: int | None, budget: Li
     power = budget.received_dbm(paths.power_db)
     legend = figures.bounce_legend()
     if by_power:
-        bar = figures.axis_over(float(power[0]) - drawing.PATH_RANGE_DB, float(power[0]), "power [dBm]")
-        legend = figures.power_legend(bar, drawing.PATH_RANGE_DB)
+        bar = figures.axis_over(float(power[0]) - figures.PATH_RANGE_DB, float(power[0]), "power [dBm]")
+        legend = figures.power_legend(bar, figures.PATH_RANGE_DB)
     order = list(range(min(count, len(power))))
     if chosen is not None and chosen in order:
         order = [chosen, *(number for number in order if number != chosen)]

@@ -1,4 +1,5 @@
-"""Predictions for the viewer: all quantities for one transmitter at one frequency, compiled once."""
+"""Predictions for the viewer: all quantities for one transmitter at one frequency, compiled once; and a walk, a closed route
+along some of the transmitters of the data."""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,10 +16,9 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Ability, GaussianState, MaterialProperties, Params, outputs_of
 from wbgs_jax.fields.calibratable import Calibratable
-from wbgs_jax.inference.evaluate_quantities import LoadedField
+from wbgs_jax.inference.evaluate_quantities import LoadedField, describe_interactions
 from wbgs_jax.inference.intervals import expected_power, expected_ssim
 from wbgs_jax.inference.kriging import correct, for_receiver
-from wbgs_jax.inference.path_table import describe_interactions
 from wbgs_jax.inference.predictor import as_observed, check_power
 from wbgs_jax.inference.radio_map import Plane, evaluate_plane, pieces
 from wbgs_jax.inference.trained_field import at_receiver, receiver_number
@@ -336,3 +336,31 @@ def _predict(
         assert arrived is not None, "the field predicts paths"
         paths = arrived, k_factor_db(arrived), delay_spread_s(arrived)
     return jax.tree.map(lambda leaf: leaf[0], (pas, seen.power_db, within, expected, paths))
+
+
+def stops_of_walk(tx_positions: Float[np.ndarray, "n 3"], count: int = 8, seed: int = 0) -> Float[np.ndarray, "count 3"]:
+    """Returns transmitters that are far apart, in the order of a short round trip."""
+    places = np.unique(tx_positions, axis=0)
+    chosen = [int(np.random.default_rng(seed).integers(len(places)))]
+    away = np.linalg.norm(places - places[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(places)):
+        chosen.append(int(np.argmax(away)))
+        away = np.minimum(away, np.linalg.norm(places - places[chosen[-1]], axis=1))
+    left, way = places[chosen], [places[chosen[0]]]
+    left = left[1:]
+    while len(left):
+        nearest = int(np.argmin(np.linalg.norm(left - way[-1], axis=1)))
+        way.append(left[nearest])
+        left = np.delete(left, nearest, axis=0)
+    return np.array(way)
+
+
+def place_on_walk(way: Float[np.ndarray, "n 3"], distance_m: float) -> Float[np.ndarray, "3"]:
+    """Returns the position after a distance along a closed route."""
+    closed = np.concatenate([way, way[:1]])
+    lengths = np.linalg.norm(np.diff(closed, axis=0), axis=1)
+    total = lengths.sum()
+    if total <= 0:
+        return way[0]
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    return np.array([np.interp(distance_m % total, along, closed[:, axis]) for axis in range(3)])

@@ -13,7 +13,7 @@ from wbgs_jax.fields.base import GaussianState
 from wbgs_jax.inference.radio_map import Plane
 from wbgs_jax.radio.geometry import covariance_factor, rotation_matrix
 from wbgs_jax.types import Receiver
-from wbgs_jax.viewer import drawing
+from wbgs_jax.viewer import figures
 from wbgs_jax.viewer.session import PathList
 
 VALID, INVALID = (31, 97, 180), (214, 39, 40)
@@ -137,7 +137,7 @@ class SceneView:
                 name,
                 self.dataset.vertices.astype(np.float32),
                 faces.astype(np.uint32),
-                color=drawing.material_color(int(material)),
+                color=figures.material_color(int(material)),
                 opacity=0.4,
                 side="double",
                 flat_shading=True,
@@ -148,7 +148,7 @@ class SceneView:
     def draw_dome(self, pas: Float[np.ndarray, "90 360"]) -> None:
         """Draws the received spectrum around the receiver."""
         radius = self.dome_radius
-        points, colors = drawing.dome(pas, self._rotation, radius)
+        points, colors = figures.dome(pas, self._rotation, radius)
         places = (points + self.rx).astype(np.float32)
         dome_point = 0.045  # size of a point of the spectrum, relative to that radius
         if self._dome is None:
@@ -167,9 +167,9 @@ class SceneView:
                 self.scene.remove_by_name(name)
             return
         points = paths.points[:count]
-        colors = drawing.path_colors(paths.power_db[:count], drawing.bounces(paths.interaction[:count]), by_power)
+        colors = figures.path_colors(paths.power_db[:count], figures.bounces(paths.interaction[:count]), by_power)
         self._draw_lines("/paths", points, colors, 2.0)
-        self._draw_handles(drawing.path_handles(points), colors, on_click)
+        self._draw_handles(figures.path_handles(points), colors, on_click)
         if chosen is not None and chosen < len(points):
             self._draw_lines("/chosen_path", points[chosen : chosen + 1], np.array([[214, 39, 40]], np.uint8), 5.0)
         else:
@@ -178,7 +178,7 @@ class SceneView:
     def _draw_lines(
         self, name: str, points: Float[np.ndarray, "k 5 3"], colors: UInt8[np.ndarray, "k 3"], thickness: float
     ) -> None:
-        segments, ends = drawing.path_segments(points, drawing.linear(colors))
+        segments, ends = figures.path_segments(points, figures.linear(colors))
         self.scene.add_line_segments(name, segments.astype(np.float32), ends, thickness=thickness, thickness_units="screen")
 
     def _draw_handles(
@@ -193,7 +193,7 @@ class SceneView:
             faces,
             upright.astype(np.float32),
             places.astype(np.float32),
-            batched_colors=drawing.linear(colors),
+            batched_colors=figures.linear(colors),
             lod="off",  # a simplified ball has no normals at its poles
             cast_shadow=False,
             receive_shadow=False,
@@ -220,7 +220,7 @@ class SceneView:
             "/gaussians",
             np.asarray(gaussians.means)[alive].astype(np.float32),
             (factor @ factor.swapaxes(-1, -2)).astype(np.float32),
-            (drawing.colored(shown, 0.0, top, drawing.GAUSSIAN_COLORS) / 255).astype(np.float32),
+            (figures.colored(shown, 0.0, top, figures.GAUSSIAN_COLORS) / 255).astype(np.float32),
             np.clip(attenuation, 0.05, 1.0)[:, None].astype(np.float32),
         )
         return top
@@ -246,7 +246,7 @@ class SceneView:
             dim: whether the map is shown as an outdated one.
             on_click: called with the place (x, y) of a click on the map, metres.
         """
-        picture = drawing.map_picture(values, *span, dim)
+        picture = figures.map_picture(values, *span, dim)
         middle = np.array([(plane.xs[0] + plane.xs[-1]) / 2, (plane.ys[0] + plane.ys[-1]) / 2, plane.height])
         width, height = (float(np.ptp(a)) * len(a) / max(len(a) - 1, 1) for a in (plane.xs, plane.ys))
         # The first row of the image is its upper edge; it is rotated about x, so that y decreases along rows and it faces up.

@@ -42,7 +42,11 @@ from wbgs_jax.interchange.sionna_arrays import scene_of_sionna
 from wbgs_jax.mesh.ply import read_ply, write_ply
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
 from wbgs_jax.training import curves
-from wbgs_jax.training.run_folder import load_trained, read_config, write_manifest
+from wbgs_jax.training.run_folder import (
+    load_trained,
+    read_config,
+    write_manifest,
+)
 from wbgs_jax.types import Gaussians
 
 

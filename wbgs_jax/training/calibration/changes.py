@@ -28,7 +28,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from wbgs_jax._util.statistics import by_transmitter
-from wbgs_jax.data.splits import group_places
+from wbgs_jax.data.dataset import group_places
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams
 from wbgs_jax.mesh.facets import areas, centres

@@ -8,7 +8,7 @@ The removal is kept if other snapshots, of all frequencies, fit significantly be
 reveal further spurious bodies, so that the test is repeated. High frequencies are not used in it: there a body that is slightly
 displaced fits worse than none.
 
-The absorption grid stands for objects that attenuate waves and are not in the mesh (propagation/absorption.py). Its density is
+The absorption grid stands for objects that attenuate waves and are not in the mesh (propagation/transport.py). Its density is
 fitted to the spectra of most transmitters by gradient descent, with everything else fixed. If those of the others fit
 significantly better with it, the grid is kept, and training refines it together with all other parameters. A grid with which
 they fit worse after a quarter of the steps is given up. With few transmitters, or with a complete mesh, there is no such
@@ -35,8 +35,7 @@ from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.batches import TrainingData, batches_of_one_receiver
 from wbgs_jax.training.calibration.antennas import ENDS
 from wbgs_jax.training.calibration.material_fit import search_materials, with_properties
-from wbgs_jax.training.calibration.objective import CalibrationProblem, surely_better
-from wbgs_jax.training.calibration.uncertainty import search_placement
+from wbgs_jax.training.calibration.objective import CalibrationProblem, search_placement, surely_better
 from wbgs_jax.training.hooks import Say, silent
 
 AIR = (1.0001, 1e-9, 0.0, 1e-4)

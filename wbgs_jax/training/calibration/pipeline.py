@@ -4,6 +4,12 @@ propagation options, array gains, positions, and the absorption grid.
 Antennas and materials are chosen from lists by how well they fit training spectra; bodies without which spectra fit better are
 removed from the mesh; surfaces of an inaccurate mesh are aligned, and their remaining position uncertainty is estimated.
 Training starts from the result.
+
+Propagation options are effects that ray tracers leave out, namely the finite thickness of walls and the curvature of waves. In
+reality a wave that passes a wall of thickness t does not acquire the phase k t cos(theta) of the air that the wall replaces;
+ray tracers whose walls are surfaces without thickness add it to the phase of the slab. In reality waves reach an array as
+spherical waves about mirrored sources; ray tracers with synthetic arrays make them plane. Data are of one kind or the other,
+which training spectra reveal.
 """
 
 import dataclasses
@@ -22,15 +28,47 @@ from wbgs_jax.fields.coherent_model import WaveParams
 from wbgs_jax.radio.antenna import is_directional
 from wbgs_jax.radio.channel import beyond_free_space_db, received_power_db
 from wbgs_jax.training.calibration.alignment import Place, learn_geometry
-from wbgs_jax.training.calibration.antennas import search_antennas, search_pair
-from wbgs_jax.training.calibration.array_gains import search_tuning
-from wbgs_jax.training.calibration.material_fit import entries_of, search_materials, unknown_mm
-from wbgs_jax.training.calibration.objective import CalibrationProblem, Scores, comparable
+from wbgs_jax.training.calibration.antennas import search_antennas, search_pair, search_tuning
+from wbgs_jax.training.calibration.material_fit import entries_of, search_materials, search_slabs, unknown_mm
+from wbgs_jax.training.calibration.objective import CalibrationProblem, Scores, comparable, search_placement, surely_better
 from wbgs_jax.training.calibration.obstacles import search_absent, search_clutter
-from wbgs_jax.training.calibration.propagation_options import search_idealisations
-from wbgs_jax.training.calibration.thickness import search_slabs
-from wbgs_jax.training.calibration.uncertainty import search_placement
 from wbgs_jax.training.hooks import Context, Edit, Hook, Say
+
+SURE = 3.0
+"""n_sigma: standard errors over transmitters by which a gain must be significant (`surely_better`)."""
+
+
+@dataclass(frozen=True)
+class Idealisation:
+    """Result for one propagation option."""
+
+    ideal: float
+    """Mean score of the spectra as in ray tracers."""
+    natural: float
+    """Mean score of the spectra as in reality."""
+    dropped: bool
+    """Whether the option is set as in reality."""
+
+
+def search_idealisations(
+    params: WaveParams, problem: CalibrationProblem, config: CalibrationConfig
+) -> tuple[WaveParams, dict[str, Idealisation]]:
+    """Returns parameters with options set as in reality if spectra fit significantly better, and the results by option. Before
+    the finite thickness of walls is tested, materials are chosen again with it."""
+    once, found, count = dataclasses.replace(config, rounds=1), {}, config.propagation_spectra
+    score, tx_index = problem.scores(count), problem.tx_index(count)
+    for name in ("curved", "thick"):
+        if float(getattr(params, name)):
+            continue
+        natural = dataclasses.replace(params, **{name: 1 + getattr(params, name)})  # a new array: training donates it once
+        if name == "thick":
+            natural, _ = search_materials(natural, problem, count, once)
+        before, after = score([params, natural])
+        dropped = surely_better(before - after, tx_index, SURE)
+        found[name] = Idealisation(float(before.mean()), float(after.mean()), dropped)
+        params = natural if dropped else params
+    return params, found
+
 
 GAINS_DB = (100.0, 5.0), (5.0, 0.5)
 """Successive ranges of the gain about the previous value, and steps within them, dB."""
