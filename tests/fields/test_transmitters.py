@@ -10,7 +10,7 @@ from builders.rooms import field_of, room
 from builders.untrained import make_field, make_params
 from scipy.spatial.transform import Rotation
 
-from wbgs_jax.fields.base import pas, received_dbm
+from wbgs_jax.fields.base import pas
 from wbgs_jax.radio.antenna import Antenna, tabulated
 from wbgs_jax.types import Query, Transmitter, check_query, make_query, make_receiver
 
@@ -63,16 +63,6 @@ def test_a_tabulated_antenna_is_that_of_its_table(setup):
     found = render(params, make_query(TX, HZ, antenna=tabulated(gain, None))).snapshots
     expected = render(params, make_query(TX, HZ, antenna=Antenna(None, jnp.array([0.0, 1.0])))).snapshots
     np.testing.assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
-
-
-@pytest.mark.heavy
-def test_absolute_powers(setup):
-    _, params, _, render = setup
-    query = make_query(TX, HZ, power_dbm=[20.0, 30.0])
-    seen = render(params, query)
-    np.testing.assert_allclose(received_dbm(seen, query), np.add(seen.power_db, [20, 30]), rtol=1e-6)
-    with pytest.raises(ValueError, match="power_dbm"):
-        received_dbm(seen, make_query(TX, HZ))
 
 
 def test_positions_alone_are_transmitters_without_further_properties():

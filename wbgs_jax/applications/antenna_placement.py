@@ -165,10 +165,6 @@ def place_antenna(
 
 PowerByBoresight = Callable[[Float[Array, "k 2"]], Float[Array, "k tx"]]
 """Azimuth and elevation of the boresight (radians, world frame) -> power (dB) from every transmitter."""
-STEP = 0.3
-"""Spacing of the directions that are tried first, radians."""
-FINEST = 0.01
-"""Size of the last steps, radians."""
 HIGHEST = 1.55
 """Largest elevation, radians."""
 
@@ -261,17 +257,20 @@ def rotate_array(
         `place` (starts, 2), radians, and `loss` (starts,), dB.
     """
     sphere = np.array([[-np.pi, -HIGHEST], [np.pi, HIGHEST]])
-    tried = jnp.asarray(grid_over(sphere, STEP))
+    step = 0.3  # spacing of the directions that are tried first, radians
+    tried = jnp.asarray(grid_over(sphere, step))
     low_high = jnp.array([[-2 * np.pi, -HIGHEST], [2 * np.pi, HIGHEST]])  # azimuths may pass +-pi
 
     def loss(angles: Float[Array, "k 2"], blur: Any) -> Float[Array, " k"]:
         return -aim(powers(angles))
 
+    finest = 0.01  # size of the last steps, radians
+
     @jax.jit
     def search(tried: Float[Array, "n 2"]) -> Descended:
         losses = in_blocks(lambda block: loss(block, 0.0), tried)
-        chosen = best_apart(tried, losses, min(starts, len(tried)), 1.5 * STEP)
-        return descend(loss, tried[chosen], low_high, shrinking(STEP / 2, FINEST, 40))
+        chosen = best_apart(tried, losses, min(starts, len(tried)), 1.5 * step)
+        return descend(loss, tried[chosen], low_high, shrinking(step / 2, finest, 40))
 
     found = search(tried)
     azimuth = jnp.mod(found.place[:, 0] + np.pi, 2 * np.pi) - np.pi

@@ -3,11 +3,11 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from wbgs_jax.inference.predictor import Predictor, predict_many
 from wbgs_jax.metrics import beam_loss_db
-from wbgs_jax.radio.array import ALIKE, codebook, pas_directions
+from wbgs_jax.radio.array import ALIKE, codebook
 
 RIGHT_DB = float(-20 * np.log10(1 - ALIKE))
 """A beam that receives at most this much less than the best one (0.45 dB) counts as equally good: a planar array receives
@@ -48,11 +48,6 @@ def rank_beams(spectra: Any, count: int = 3) -> Int[np.ndarray, "n count"]:
         raise ValueError(f"count is {count}; give 1 to {len(beams)} beams")
     received = values.reshape(-1, 90 * 360)[:, beams]
     return np.argsort(-received, axis=1, kind="stable")[:, :count]
-
-
-def beam_directions() -> Float[np.ndarray, "64 3"]:
-    """Returns the unit vectors (float64, receiver's frame) of the codebook's beams."""
-    return pas_directions().reshape(-1, 3)[codebook()]
 
 
 def choose_beams(predict: Predictor, tx_positions: Any, frequencies_hz: Any, count: int = 3) -> Int[np.ndarray, "n count"]:

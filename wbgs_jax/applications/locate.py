@@ -33,20 +33,12 @@ POOLED = 10
 """Pixels along each axis that are averaged before spectra are compared: an array of 4 x 4 elements resolves 25 degrees."""
 BLUR = 0.5
 """Smoothing length of the predictions on the grid, relative to the grid spacing."""
-NARROWEST_M = 0.12
-"""Final smoothing length, metres. Below it, some wrong position matches the fringes of a field that is not accurate to
-millimetres better than the right one does: among the end points, those of validation transmitters of scenes 2 and 4 are ranked
-best with this smoothing, and worst with none."""
 NOISE = 0.01
 """Error (one minus the cosine) of a trained field's spectra at the true position, median over frequencies. Much larger errors
 indicate that the field is wrong there, and say little about the position: the loss grows only with their logarithm."""
 LEVELS, STEPS = 2, 3
 """Number of smoothing lengths, down to the final one by equal factors, and steps at each."""
 FAINTEST = 1e-12
-SMALL = 1e-6
-"""Added to denominators."""
-LARGEST_DB = 20.0
-"""Errors of received powers saturate at this value: a missing path can cause an error of any size."""
 
 
 class Located(NamedTuple):
@@ -200,7 +192,11 @@ def _locate(locator: Locator, observed: Array) -> Located:
         return _residuals(locator, locator.predict(places, blur), target)
 
     first = BLUR * locator.step
-    blurs = shrinking(first, min(NARROWEST_M, first), LEVELS)
+    # Final smoothing length, metres. Below it, some wrong position matches the fringes of a field that is not accurate to
+    # millimetres better than the right one does: among the end points, those of validation transmitters of scenes 2 and 4 are
+    # ranked best with this smoothing, and worst with none
+    narrowest_m = 0.12
+    blurs = shrinking(first, min(narrowest_m, first), LEVELS)
     found = gauss_newton(residuals, locator.places[chosen], locator.box, blurs, STEPS)
     return Located(found.place[0], found.loss[0], found.place[1:], found.loss[1:])
 
@@ -247,16 +243,18 @@ def _unit(values: Array) -> Float[Array, "k m"]:
 def _residuals(locator: Locator, answers: Float[Array, "k links m"], target: Float[Array, "links m"]) -> Float[Array, "k n"]:
     """Returns residuals whose squares add up to the loss, a mean over links."""
     error = answers - target
+    largest_db = 20.0  # errors of received powers saturate at this value: a missing path can cause an error of any size
     if locator.what == "power":
         received = target > NO_PATH_DB
         count = jnp.maximum(jnp.sum(received), 1)
         error = jnp.where(received, error, 0)
         if not locator.known_power:
             error = jnp.where(received, error - jnp.sum(error, 1, keepdims=True) / count, 0)
-        saturated = error / jnp.sqrt(1 + (error / LARGEST_DB) ** 2)
+        saturated = error / jnp.sqrt(1 + (error / largest_db) ** 2)
         return saturated[..., 0] / jnp.sqrt(count)
     error = error / np.sqrt(2)  # one minus the cosine is half the squared distance
-    off = jnp.sum(error**2, -1, keepdims=True) / NOISE + SMALL
+    small = 1e-6  # added to denominators
+    off = jnp.sum(error**2, -1, keepdims=True) / NOISE + small
     saturated = error * jnp.sqrt(jnp.log1p(off) / off)  # squares add up to NOISE log(1 + (1 - cosine) / NOISE)
     return saturated.reshape(len(error), -1) / np.sqrt(len(target))
 

@@ -17,10 +17,6 @@ from scipy.spatial.distance import cdist
 
 NUGGET = 0.15
 """Variance of what a measurement does not share with its surroundings, such as fading, relative to the variance of errors."""
-LEAST = 1e-9
-"""Smallest conditional variance that is divided by."""
-SWAPS = 1000
-"""Maximum number of reversals that shorten a walk."""
 
 
 class NextPlaces(NamedTuple):
@@ -96,7 +92,8 @@ def walking_order(places: Any, start: Any = None) -> Int[np.ndarray, " n"]:
         order.append(min(left, key=lambda one: float(distance[order[-1], one])))
         left.remove(order[-1])
     walk = np.array(order, int)
-    for _ in range(SWAPS):
+    swaps = 1000  # maximum number of reversals that shorten a walk
+    for _ in range(swaps):
         if (shorter := _reversed_part(walk, distance)) is None:
             break
         walk = shorter
@@ -129,7 +126,8 @@ def _given(
         between, own = (np.exp(-cdist(measured, places) / length) for places in (candidates, measured))
         own[np.diag_indices(len(measured))] += NUGGET
         covariance -= between.T @ cho_solve(cho_factor(own), between)
-    scale = expected_error / np.sqrt(np.maximum(np.diag(covariance), LEAST))
+    least = 1e-9  # smallest conditional variance that is divided by
+    scale = expected_error / np.sqrt(np.maximum(np.diag(covariance), least))
     covariance *= np.outer(scale, scale)
     return covariance
 

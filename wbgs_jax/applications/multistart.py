@@ -16,30 +16,22 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import AnyArray
 from wbgs_jax.radio.array import EXACT
 
-AnyArray = Array | np.ndarray
 Loss = Callable[[Float[Array, "k n"], Any], Float[Array, " k"]]
 """(points (k, n), smoothing length in metres) -> loss of every point independently; differentiable in reverse mode."""
 Residuals = Callable[[Float[Array, "k n"], Any], Float[Array, "k m"]]
 """(points (k, n), smoothing length in metres) -> residuals of every point independently; their squares add up to its loss."""
 STEP = 0.3
 """Length of a gradient step along each axis, relative to the smoothing length."""
-MOMENTS = 0.7, 0.9
-"""Moment decay rates of Adam: short averages, for tens of steps on a loss that sharpens meanwhile."""
 ASIDE = 0.2
 """Step of Gauss-Newton's finite differences, relative to the smoothing length ..."""
-FARTHEST = 2.0
-"""... and the longest step that it takes."""
 DAMPING, EASED, RAISED = 1e-2, 0.2, 10.0
 """Damping of Gauss-Newton: relative to the mean curvature initially, and factors after a step that helped and one that did
 not."""
-TINY = 1e-12
-MOST_PLACES = 1_000_000
 BLOCK = 16
 """Number of points evaluated together."""
-FAR = 1e6
-"""Added to the losses of points that are taken or near one that is, so that the remaining ones are chosen first."""
 
 
 class Descended(NamedTuple):
@@ -65,8 +57,9 @@ def grid_over(box: Float[np.ndarray, "2 n"], step: float) -> Float[np.ndarray, "
             f"no points between {low} and {high}, {step:g} m apart; give the lowest corner first and a step above 0"
         )
     counts = np.maximum(np.ceil((high - low) / step - 1e-9), 1).astype(int)
-    if np.prod(counts.astype(float)) > MOST_PLACES:
-        raise UserError(f"a step of {step:g} m gives more than {MOST_PLACES:,} points; give a larger one or a smaller box")
+    most_places = 1_000_000
+    if np.prod(counts.astype(float)) > most_places:
+        raise UserError(f"a step of {step:g} m gives more than {most_places:,} points; give a larger one or a smaller box")
     axes = [a + (np.arange(n) + 0.5) * (b - a) / n for a, b, n in zip(low, high, counts, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(low)).astype(np.float32)
 
@@ -77,10 +70,12 @@ def best_apart(
     """Returns the indices of the `count` points of lowest loss that are at least `apart` from each other; if there are fewer,
     the best of the others follow."""
 
+    far = 1e6  # added to the losses of points that are taken or near one that is, so that the remaining ones are chosen first
+
     def choose(left: Float[Array, " places"], _: None) -> tuple[Float[Array, " places"], Int[Array, ""]]:
         best = jnp.argmin(left)
         near = jnp.sum((places - places[best]) ** 2, -1) < apart**2
-        return jnp.where(near, left + FAR, left).at[best].add(FAR), best
+        return jnp.where(near, left + far, left).at[best].add(far), best
 
     return jax.lax.scan(choose, losses, None, length=count)[1]
 
@@ -112,7 +107,8 @@ def descend(loss: Loss, starts: Float[Array, "k n"], box: Float[Array, "2 n"], b
         blurs: smoothing length of every step, metres.
     """
     low, high = jnp.asarray(box, starts.dtype)
-    adam = optax.scale_by_adam(*MOMENTS)
+    moments = 0.7, 0.9  # moment decay rates of Adam: short averages, for tens of steps on a loss that sharpens meanwhile
+    adam = optax.scale_by_adam(*moments)
     slopes = jax.value_and_grad(lambda places, blur: jnp.sum(loss(places, blur)))
 
     def step(carry: tuple[Array, optax.OptState], blur: Float[Array, ""]) -> tuple[tuple[Array, optax.OptState], None]:
@@ -166,16 +162,19 @@ def gauss_newton(
         curvature = jnp.einsum("kim,kjm->kij", jacobian, jacobian, precision=EXACT)
         return _Slopes(place, jnp.sum(here**2, -1), slope, curvature)
 
+    farthest = 2.0  # the longest step, in smoothing lengths
+    tiny = 1e-12
+
     def step(carry: tuple[_Slopes, Float[Array, "k n"], Float[Array, " k"]], blur: Float[Array, ""]) -> Any:
         best, place, damping = carry
         tried = look(place, blur)
         helped = tried.loss < best.loss  # false for NaN
         best = jax.tree.map(lambda a, b: jnp.where(helped.reshape(-1, *[1] * (a.ndim - 1)), a, b), tried, best)
         damping = damping * jnp.where(helped, EASED, RAISED)
-        scale = damping * jnp.trace(best.curvature, axis1=-2, axis2=-1) / n + TINY
+        scale = damping * jnp.trace(best.curvature, axis1=-2, axis2=-1) / n + tiny
         move = -jnp.linalg.solve(best.curvature + scale[:, None, None] * jnp.eye(n), best.slope[..., None])[..., 0]
         length = jnp.linalg.norm(move, axis=-1, keepdims=True)
-        move = move * jnp.minimum(1, FARTHEST * blur / jnp.maximum(length, TINY))
+        move = move * jnp.minimum(1, farthest * blur / jnp.maximum(length, tiny))
         return (best, jnp.clip(best.place + move, low, high), damping), None
 
     def level(place: Float[Array, "k n"], blur: Float[Array, ""]) -> Any:

@@ -27,8 +27,6 @@ from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude
 from wbgs_jax.radio.channel import decibels, free_space_db
 from wbgs_jax.types import make_query, make_receiver
 
-STEPS = 60
-"""Gradient steps."""
 STEEPEST = 1.45
 """Largest angle of the normal above or below the horizon, radians: the azimuth of a vertical normal is undefined."""
 NEAREST_M = 1e-3
@@ -227,6 +225,8 @@ def place_reflector(
     def loss(poses: Float[Array, "k 5"], blur: Any) -> Float[Array, " k"]:
         return loss_of(plate.power_db(poses, blur))
 
+    steps = 60  # gradient steps
+
     @jax.jit
     def search(centres: Float[Array, "n 3"]) -> Descended:
         def tried(block: Float[Array, "k 3"]) -> Float[Array, "k 6"]:
@@ -235,7 +235,7 @@ def place_reflector(
 
         found = in_blocks(tried, centres)
         chosen = best_apart(centres, found[:, 5], count, 1.5 * step)
-        return descend(loss, found[chosen, :5], low_high, shrinking(step / 2, min(NARROWEST_M, step / 2), STEPS))
+        return descend(loss, found[chosen, :5], low_high, shrinking(step / 2, min(NARROWEST_M, step / 2), steps))
 
     return search(jnp.asarray(centres))
 

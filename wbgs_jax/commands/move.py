@@ -35,12 +35,8 @@ if TYPE_CHECKING:
 
 MOST = 20_000
 """Maximum number of instants."""
-AT_ONCE = 200
-"""Instants that are computed together."""
 FEWEST = 500
 """Minimum number of instants of the default rate."""
-SPARE = 1.25
-"""Rate relative to the lowest one that resolves the Doppler shifts."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +100,8 @@ def times_of(command: Command, frequency_hz: float) -> Float[np.ndarray, " t"]:
     bodies = length_of(parse_positions(command.person, "--person"))
     bodies = max(bodies, float(np.linalg.norm(_vector(command.body_shift, "--body-shift"))))
     needed = 2 * (sum(ends) + 2 * bodies) / command.seconds * frequency_hz / SPEED_OF_LIGHT
-    rate = max(SPARE * needed, FEWEST / command.seconds) if command.rate is None else command.rate
+    spare = 1.25  # rate relative to the lowest one that resolves the Doppler shifts
+    rate = max(spare * needed, FEWEST / command.seconds) if command.rate is None else command.rate
     count = round(rate * command.seconds)
     if not 2 <= count <= MOST:
         raise UserError(f"{count:,} instants are not 2 to {MOST:,}; give other --seconds, or --rate R in instants per second")
@@ -147,10 +144,11 @@ def simulate(command: Command) -> None:
     field, params, motion = motion_of(command, *loaded.trained.field.receiver_independent(loaded.trained.params), share)
     tx = position_along(parse_positions(command.tx), share)
     warn(loaded.domain, loaded.receiver.position, parse_positions(command.tx), np.array([frequency_hz]))
-    blocks = -(-len(seconds) // AT_ONCE)
-    with CountProgress(f"channel, blocks of {AT_ONCE} instants", blocks) as progress:
+    at_once = 200  # instants that are computed together
+    blocks = -(-len(seconds) // at_once)
+    with CountProgress(f"channel, blocks of {at_once} instants", blocks) as progress:
         query = make_query(tx, frequency_hz)
-        found = channel_over_time(field, params, loaded.receiver, query, motion, rate_hz, AT_ONCE, progress.advance)
+        found = channel_over_time(field, params, loaded.receiver, query, motion, rate_hz, at_once, progress.advance)
     found = {"time_s": seconds, "tx_position": tx} | found
     power_db = found["power_db"]
     low, middle, high = (f"{value:.1f}" for value in np.quantile(power_db, (0, 0.5, 1)))

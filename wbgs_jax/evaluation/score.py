@@ -50,10 +50,6 @@ def repeatability(scene: str, ghz: Iterable[float]) -> float | None:
     return float(np.mean([recorded[name] for name in names])) if names and all(name in recorded for name in names) else None
 
 
-COVERAGES = (1.0, 0.9, 0.75, 0.5, 0.25, 0.1)
-"""Fractions of the predictions, the most certain ones first, whose mean score is reported."""
-
-
 def calibration(expected: Expected, scores: Float[np.ndarray, " n"], level: float) -> dict[str, Any] | None:
     """Returns a comparison of expected and actual SSIM: `coverage` of the intervals and their mean `width`, the mean `expected`
     and actual (`scored`) SSIM, their rank `correlation` (Spearman), and the `risk_coverage` curve: the mean SSIM of the most
@@ -103,13 +99,15 @@ def _figures(
     ranks, equal = np.unique(uncertainty, return_inverse=True)
     means = np.bincount(equal, truth, len(ranks)) / np.bincount(equal, minlength=len(ranks))
     most_certain = means[np.sort(equal)]
+    # Fractions of the predictions, the most certain ones first, whose mean score is reported
+    coverages = (1.0, 0.9, 0.75, 0.5, 0.25, 0.1)
     return {
         "level": round(level, 4),
         "coverage": float(covered.mean()),
         "expected": float(expectation.mean()),
         "scored": float(truth.mean()),
         "correlation": _rank_correlation(expectation, truth),
-        "risk_coverage": {f"{share:g}": float(most_certain[: max(1, round(share * len(truth)))].mean()) for share in COVERAGES},
+        "risk_coverage": {f"{share:g}": float(most_certain[: max(1, round(share * len(truth)))].mean()) for share in coverages},
     }
 
 

@@ -462,18 +462,6 @@ def compare(seen: Observation, batch: Batch, ssim_weight: float = 0.2, ssim_stri
     return error, Aux({})
 
 
-def received_dbm(seen: Observation, links: Query) -> Float[Array, " b"]:
-    """Returns the absolute received powers (dBm) of predictions for links whose transmitted powers are given.
-
-    Raises:
-        ValueError: the field predicts no received power, or the transmitted power is unknown.
-    """
-    power_dbm = links.transmitter.power_dbm
-    if seen.power_db is None or power_dbm is None:
-        raise ValueError("a received power in dBm needs a field that predicts power, and `power_dbm` of the transmitters")
-    return seen.power_db + power_dbm
-
-
 def power_error_db(seen: Observation, batch: Batch) -> Float[Array, ""] | None:
     """Returns the mean absolute error of received power (dB) over the links on which a signal was received; None if the field
     does not predict it or the batch does not contain it."""

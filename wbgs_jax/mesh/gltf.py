@@ -32,7 +32,6 @@ SUPPORTED = {
     "EXT_texture_webp",
 }
 """Extensions that may be required: supported ones that concern geometry, and ones that concern appearance and do not matter."""
-APPEARANCE = ("KHR_materials_", "KHR_texture_", "MSFT_texture_", "EXT_texture_", "EXT_lights_")
 COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 
 
@@ -133,8 +132,9 @@ def read_gltf(file: Path) -> list[Body]:
     """
     opened = _File(file)
     document = opened.document
+    appearance = ("KHR_materials_", "KHR_texture_", "MSFT_texture_", "EXT_texture_", "EXT_lights_")
     for name in document.get("extensionsRequired", []):
-        if name not in SUPPORTED and not name.startswith(APPEARANCE):
+        if name not in SUPPORTED and not name.startswith(appearance):
             where = _first_object(document, name)
             raise UserError(f"{file} requires the extension {name}{where}, which is not supported; export it without")
     if str(document.get("asset", {}).get("version", "2"))[:1] == "1":

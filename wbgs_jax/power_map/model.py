@@ -161,8 +161,6 @@ LAW = np.array([-45.0, 2.0, 6.0, 15.0])
 """Prior means of the power at one metre (dBm), the exponent, the loss of a wall and of a ceiling (dB), ..."""
 LAW_WIDTH = np.array([30.0, 1.0, 4.0, 8.0])
 """... and their prior standard deviations."""
-CLASS_WIDTH = 4.0
-"""Prior standard deviation of the additional loss of walls of a class, dB."""
 APART = 5.0
 """Standard deviation of the error of the law where readings within a metre count as one, dB."""
 NEAREST = 0.1
@@ -304,7 +302,8 @@ def fit_law(
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
     """Returns the law by least squares with a normal prior, and its covariance."""
     classes = features.shape[-1] - len(LAW)
-    prior, width = np.append(LAW, np.zeros(classes)), np.append(LAW_WIDTH, np.full(classes, CLASS_WIDTH))
+    class_width = 4.0  # prior standard deviation of the additional loss of walls of a class, dB
+    prior, width = np.append(LAW, np.zeros(classes)), np.append(LAW_WIDTH, np.full(classes, class_width))
     side = 1.0  # metres: the readings within a cube of this size count as one reading in the fit of the law
     _, cube = np.unique(np.floor(readings.places / side).astype(int), axis=0, return_inverse=True)
     received = np.isfinite(readings.powers)

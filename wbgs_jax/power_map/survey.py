@@ -18,13 +18,6 @@ HEIGHT_M = 1.3
 """Height of the transmitters above the floor if the readings have no z."""
 CELL_M = 0.25
 """Side of the cells over which readings are averaged."""
-STOREY_M = 1.0
-"""Maximum height of enlarged cells: higher ones average storeys, metres."""
-ONE_STOREY_M = 2.5
-"""Largest difference of heights of readings, or of readings and a receiver, within one storey, metres."""
-BEYOND_M = 2.0
-"""Distance (metres) from readings, receivers and walls up to which predictions have an interval: it includes the next room, not
-the next building."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +47,10 @@ class Survey:
             most = 10.0  # metres by which walls extend the box
             low[:2] = np.clip(ends.min(0), low[:2] - most, low[:2])
             high[:2] = np.clip(ends.max(0), high[:2], high[:2] + most)
-        return Domain("the readings", np.stack([low, high]), (0.0, np.inf), BEYOND_M)
+        # Distance (metres) from readings, receivers and walls up to which predictions have an interval: it includes the next
+        # room, not the next building
+        beyond_m = 2.0
+        return Domain("the readings", np.stack([low, high]), (0.0, np.inf), beyond_m)
 
 
 def load_survey(folder: Path, height_m: float = HEIGHT_M, cell_m: float = CELL_M, floor_plan: Path | None = None) -> Survey:
@@ -78,16 +74,17 @@ def load_survey(folder: Path, height_m: float = HEIGHT_M, cell_m: float = CELL_M
             f"{folder}: readings of {len(set(readings.rooms))} rooms give at least {fewest} cells, but a map has at most "
             f"{MAX_PLACES}; name the room, not the reading, in the columns of rooms and floors, or leave them out"
         )
-    if (fewest := len(cell_means(readings, largest_m, STOREY_M).places)) > MAX_PLACES:
+    storey_m = 1.0  # maximum height of enlarged cells: higher ones average storeys, metres
+    if (fewest := len(cell_means(readings, largest_m, storey_m).places)) > MAX_PLACES:
         raise UserError(
-            f"{folder}: heights z give at least {fewest} cells of {STOREY_M:g} m, but a map has at most {MAX_PLACES}; divide "
+            f"{folder}: heights z give at least {fewest} cells of {storey_m:g} m, but a map has at most {MAX_PLACES}; divide "
             "the readings by storey or by part of the building"
         )
     cells = cell_means(readings, cell_m)
     _note_spacing(folder, cells.places, cell_m)
     while len(cells.places) > MAX_PLACES:
         cell_m *= 2
-        cells = cell_means(readings, cell_m, STOREY_M)
+        cells = cell_means(readings, cell_m, storey_m)
     walls = find_walls(folder, floor_plan)
     _check_plan(f"floor plan of {folder}" if floor_plan is None else f"floor plan {floor_plan}", walls, cells)
     _note_storeys(folder, cells)
@@ -117,14 +114,15 @@ def _note_storeys(folder: Path, cells: Readings) -> None:
         )
     of_storey = storeys_of(cells.places, ceilings)
     high = max(float(np.ptp(heights[of_storey == one])) for one in np.unique(of_storey))
-    if high > ONE_STOREY_M:
+    one_storey_m = 2.5  # largest difference of heights of readings, or of readings and a receiver, within one storey, metres
+    if high > one_storey_m:
         warnings.warn(
             f"{folder}: heights z of readings range over {high:.2g} m without a gap, and no ceiling attenuates among them; "
             "leave out readings between storeys",
             stacklevel=3,
         )
     away = np.maximum(cells.receivers[:, 2] - heights.max(), heights.min() - cells.receivers[:, 2])
-    if away.max() > ONE_STOREY_M:
+    if away.max() > one_storey_m:
         warnings.warn(
             f"{folder}: receiver {away.argmax() + 1} is {away.max():.2g} m above or below all readings; the loss of a ceiling "
             "in between is not known, and corrected only near the readings",

@@ -30,16 +30,12 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.progress_lines import Bar, Pulse
 from wbgs_jax.fields import Field
 
-HELD_OUT = ("held_out_ssim", "held_out_power_error_db")
-"""Metrics that are evaluated at intervals, and displayed until the next evaluation."""
 LABELS = {
     "batch_ssim": "SSIM of the batch",
     "batch_ssim_wave": "of its coherent half",
     "held_out_ssim": "SSIM on validation",
     "held_out_power_error_db": "power error on validation (dB)",
 }
-UNSHOWN = ("step", "seconds", "materials", "facets", "edges")
-"""Entries that are not displayed: most of these numbers do not change."""
 
 
 class TrainingProgress:
@@ -84,8 +80,12 @@ class TrainingProgress:
     def update(self, entry: dict[str, Any]) -> None:
         """Shows an entry of the curves: step, loss, metrics of the batches, sizes of the field, held-out figures."""
         step = int(entry["step"])
-        self.held_out = {name: entry[name] for name in HELD_OUT if entry.get(name) is not None} or self.held_out
-        shown = {LABELS.get(name, name): value for name, value in (entry | self.held_out).items() if name not in UNSHOWN}
+        # Metrics that are evaluated at intervals, and displayed until the next evaluation
+        held_out = ("held_out_ssim", "held_out_power_error_db")
+        self.held_out = {name: entry[name] for name in held_out if entry.get(name) is not None} or self.held_out
+        # Entries that are not displayed: most of these numbers do not change
+        unshown = ("step", "seconds", "materials", "facets", "edges")
+        shown = {LABELS.get(name, name): value for name, value in (entry | self.held_out).items() if name not in unshown}
         figures = [f"{name} {value:.4g}" for name, value in shown.items() if value is not None]
         elapsed = max(time.monotonic() - self.started, 1e-9)
         rate = (step - self.start_step) / elapsed if self.entries > 1 else None

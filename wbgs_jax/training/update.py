@@ -58,16 +58,10 @@ from wbgs_jax.types import Receiver
 
 FEWEST_TX = 5
 """Minimum number of new transmitters, and of old ones."""
-LEAST_GAIN_DB = 0.5
-"""Smallest change of a common gain that is corrected."""
 AFFECTED = 0.02
 """Change of a predicted spectrum, one minus its SSIM with the earlier prediction, from which on a place is affected."""
-MOST_TX = 256
-"""Number of transmitters whose spectra are predicted before and after; the others are like the nearest of them."""
 SCENE, RECORD = "scene.npz", "update.json"
 """Data of the changed room, and what has changed, in the run folder."""
-ON_SURFACE_M = 1e-3
-"""Distance (metres) of a triangle's centre from the plane of the facet that it is part of."""
 
 
 @dataclass(frozen=True)
@@ -195,7 +189,9 @@ def affected_links(
     """
     learned = np.unique(dataset.frequencies_hz[training_links(dataset)])
     used = np.isin(dataset.frequencies_hz, learned[[0, len(learned) // 2]])
-    chosen = rng.permutation(np.unique(dataset.tx_index))[:MOST_TX]
+    # Number of transmitters whose spectra are predicted before and after; the others are like the nearest of them
+    most_tx = 256
+    chosen = rng.permutation(np.unique(dataset.tx_index))[:most_tx]
     index = np.flatnonzero(used & np.isin(dataset.tx_index, chosen))
     pas = [observe_links(field, params, dataset, index).pas for field, params in ((before, old), (after, now))]
     changed = 1 - ssim(*(np.asarray(one) for one in pas)) > AFFECTED
@@ -242,12 +238,13 @@ def _triangles_of(
     """Returns which triangles lie on the facets of rigid bodies, at their nominal positions."""
     facets, low_high = field.facets, box_of(field, movers)
     own = np.isin(np.asarray(facets.mover), movers)
-    off = np.abs(np.asarray(field.motion.shift)[movers]).max(initial=0) + ON_SURFACE_M
+    on_surface_m = 1e-3  # distance (metres) of a triangle's centre from the plane of the facet that it is part of
+    off = np.abs(np.asarray(field.motion.shift)[movers]).max(initial=0) + on_surface_m
     middle = triangles.mean(1)
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-30)
     away = np.abs(middle @ np.asarray(facets.normal)[own].T - np.asarray(facets.offset)[own])
-    on_plane = (away < off) & (normal @ np.asarray(facets.normal)[own].T > 1 - ON_SURFACE_M)
+    on_plane = (away < off) & (normal @ np.asarray(facets.normal)[own].T > 1 - on_surface_m)
     inside = ((triangles > low_high[0] - off) & (triangles < low_high[1] + off)).all((1, 2))
     found: Bool[np.ndarray, " t"] = on_plane.any(1) & inside
     return found
@@ -326,7 +323,8 @@ def updated(trained: TrainedField, old: Dataset, new: Dataset, false_alarms: flo
     of_new = dataclasses.replace(problem, spectra=new_links)
     now, own, changes = find_changes(of_new, params, limit_of(evidence, false_alarms, rng), say)
     gain_db = 0.0
-    if noticed.p_values["power"] <= false_alarms / len(STATISTICS) and abs(power_change_db(evidence)) > LEAST_GAIN_DB:
+    least_gain_db = 0.5  # smallest change of a common gain that is corrected
+    if noticed.p_values["power"] <= false_alarms / len(STATISTICS) and abs(power_change_db(evidence)) > least_gain_db:
         gain_db = power_change_db(evidence)
         own = dataclasses.replace(own, log_gain=own.log_gain + jnp.float32(gain_db * np.log(10) / 20))
     if not changes and not gain_db:

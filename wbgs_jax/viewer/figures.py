@@ -27,7 +27,6 @@ PATH_RANGE_DB = 40.0
 """Range of the colours of paths below the strongest one; weaker paths fade."""
 BY_BOUNCES = np.array([[0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167]], np.uint8)
 """Colours of paths with 0, 1, 2 and 3 reflections or diffractions (Okabe and Ito; distinguishable by the colour-blind)."""
-BOUNCE_WORDS = "none", "one", "two", "three"
 
 
 def colored(values: Float[np.ndarray, "*n"], low: float, high: float, name: str = COLORS) -> UInt8[np.ndarray, "*n 3"]:
@@ -264,7 +263,8 @@ def legend(axis: Axis, colors: str, part: tuple[float, float] = (0.0, 1.0)) -> s
 def bounce_legend() -> str:
     """Returns the legend of the colours of paths by their number of reflections and diffractions."""
     parts = []
-    for number, (color, word) in enumerate(zip(BY_BOUNCES, BOUNCE_WORDS, strict=True)):
+    bounce_words = "none", "one", "two", "three"
+    for number, (color, word) in enumerate(zip(BY_BOUNCES, bounce_words, strict=True)):
         u = 8 + 84 * number
         parts.append(f'<rect x="{u}" y="6" width="10" height="10" fill="rgb{tuple(int(c) for c in color)}"/>')
         parts.append(f'<text x="{u + 14}" y="15">{word}</text>')

@@ -44,21 +44,11 @@ from wbgs_jax.training.calibration.objective import CalibrationProblem, Compared
 from wbgs_jax.training.hooks import Say, silent
 from wbgs_jax.types import Links
 
-STEP = 0.012
-"""Learning rate of motions, in wavelengths of the highest frequency."""
-LONGEST_STEP = 2e-3
-"""Upper bound of this learning rate, metres."""
 UNSEEN = 3e-3
 """Gradient of the loss, per radian of a path's phase, below which steps shrink with the gradient, since the surface has hardly
 any effect."""
-BATCH = 8
-"""Links per step."""
-SHORTEST_ARM = 0.05
-"""Minimum lever arm of rotations, metres, for small bodies."""
 RATE = 5e-3
 """Learning rate of the materials and corrections."""
-SEARCHED = ("transmitter", "element", "placement", "thick", "curved")
-"""Parameters that other parts of the calibration determine; they are not changed here."""
 
 
 def descend(
@@ -84,9 +74,12 @@ def descend(
         count: number of steps.
         rng: random numbers.
     """
-    batches = batches_of_one_receiver(data, pool, count, BATCH, rng)
+    batch = 8  # links per step
+    batches = batches_of_one_receiver(data, pool, count, batch, rng)
     wavelength = SPEED_OF_LIGHT / float(np.asarray(data.links.frequency_hz)[pool].max())
-    rate, unseen = min(STEP * wavelength, LONGEST_STEP), UNSEEN * 2 * np.pi / wavelength
+    step = 0.012  # learning rate of motions, in wavelengths of the highest frequency
+    longest_step = 2e-3  # upper bound of this learning rate, metres
+    rate, unseen = min(step * wavelength, longest_step), UNSEEN * 2 * np.pi / wavelength
     # Curvature of the normal prior, relative to a loss that is a mean over this number of values.
     numbers = len(pool) * data.receivers.element_positions.shape[-2]
     prior = jax.tree.map(lambda far: 1 / (far**2 * numbers), widths)
@@ -122,10 +115,13 @@ def _steps(
         pulled = jax.tree.map(lambda stiffness, far: 0.5 * jnp.sum(stiffness * far**2), prior, total)
         return loss + field.penalty(params) + sum(jax.tree.leaves(pulled))
 
+    # Parameters that other parts of the calibration determine; they are not changed here
+    searched = ("transmitter", "element", "placement", "thick", "curved")
+
     def step(carry: Any, index: Int[Array, " b"]) -> tuple[Any, None]:
         (params, metres), (own, shift) = carry
         gradient, pull = jax.grad(objective)((params, metres), index)
-        still = {name: jax.tree.map(jnp.zeros_like, getattr(gradient, name)) for name in SEARCHED}
+        still = {name: jax.tree.map(jnp.zeros_like, getattr(gradient, name)) for name in searched}
         gradient = dataclasses.replace(gradient, **still)
         updates, own = others.update(gradient, own)
         moves, shift = shifts.update(pull, shift)
@@ -142,7 +138,8 @@ def _reach(field: Calibratable) -> Motion:
     only changes phases along its array, and is treated like metres."""
     facets, movers = field.facets, len(field.motion.shift)
     arms = jnp.linalg.norm(facets.corners - centres(facets, movers)[facets.mover][:, None], axis=-1)
-    radius = jnp.full(movers, SHORTEST_ARM).at[facets.mover].max(jnp.max(arms, -1))
+    shortest_arm = 0.05  # minimum lever arm of rotations, metres, for small bodies
+    radius = jnp.full(movers, shortest_arm).at[facets.mover].max(jnp.max(arms, -1))
     one = jnp.ones_like(field.motion.receiver)
     return Motion(jnp.ones((movers, 3)), jnp.broadcast_to(radius[:, None], (movers, 3)), one, one)
 
@@ -151,21 +148,12 @@ def _by(metres: Motion, reach: Motion) -> Motion:
     return jax.tree.map(lambda leaf, far: leaf / far, metres, reach)
 
 
-SPREAD = 0.05
-"""position_std that is assumed when materials are chosen, in wavelengths of the highest frequency; limited to the prior."""
-TRACED_AGAIN = 5.0
-"""Ratio of frequencies after which surfaces are displaced and paths are traced again."""
 APART = 1.5
 """Minimum ratio of two successive maximum frequencies of the snapshots, except for the highest."""
-TURN = 1e-3
-"""Prior standard deviation (radians) of the rotation of surfaces."""
 HELD_RECEIVER, FREE_RECEIVER = (1e-3, 2e-3), (1e-2, 1e-2)
 """Prior standard deviations (metres, radians) of the displacement and rotation of the receiver: "held", since a common
 displacement of all walls is easily attributed to the receiver, and "free". If a free receiver moves far, the result with it
 free replaces the other if spectra fit significantly better; otherwise both are refined to the end."""
-MORE = 2
-"""Number of repetitions of the estimate of positions with the chosen materials if thicknesses are unknown, since thicknesses
-and positions depend on each other. If thicknesses are known, once is sufficient."""
 MOST = 5
 """Maximum number of these repetitions for a free receiver, which can be far from its nominal position: correctly placed walls
 that have compensated for it return slowly. Positions are estimated again until the receiver moves by less than a standard
@@ -315,7 +303,10 @@ def _refined(now: Place, receiver: tuple[float, float], observed: _Observed) -> 
     now = dataclasses.replace(now, likely=None)  # slabs of earlier positions rule nothing out
     moved = [now, observed.with_materials(now, config.rounds, "snapshots", sized=True)]
     unknown = bool(np.any(np.asarray(now.field.known_thickness) == 0))
-    least = 0 if data.snapshots is None else MORE if unknown else 1
+    # Number of repetitions of the estimate of positions with the chosen materials if thicknesses are unknown, since
+    # thicknesses and positions depend on each other. If thicknesses are known, once is sufficient
+    more = 2
+    least = 0 if data.snapshots is None else more if unknown else 1
     most = MOST if least and receiver == FREE_RECEIVER else least
     for times in range(1, most + 1):
         before = moved[-1].field.motion
@@ -374,13 +365,16 @@ def _aligned(now: Place, observed: _Observed, links: Links, receiver: tuple[floa
     motion, widths = none, _widths(none, config.geometry_width, receiver)
     variances, numbers = np.asarray(ravel_pytree(widths)[0], np.float64) ** 2, adjusted_numbers(now.prepared, none)
     covariance = np.diag(variances[numbers])
+    # position_std that is assumed when materials are chosen, in wavelengths of the highest frequency; limited to the prior
+    spread = 0.05
+    traced_again = 5.0  # ratio of frequencies after which surfaces are displaced and paths are traced again
     for highest in frequencies_apart(frequency):
         observed.say(f"calibration: positions of surfaces, up to {highest / 1e9:.4g} GHz")
-        if highest > TRACED_AGAIN * traced_at:
+        if highest > traced_again * traced_at:
             now, motion = _retraced(dataclasses.replace(now, field=now.field.moved(motion)), now.params, links, data), none
             now = observed.with_materials(now, 1) if named else now
             traced_at = float(highest)
-        now = _uncertain(now, min(SPREAD * SPEED_OF_LIGHT / float(highest), config.geometry_width))
+        now = _uncertain(now, min(spread * SPEED_OF_LIGHT / float(highest), config.geometry_width))
         pool = observed.spectra[frequency <= highest * (1 + 1e-6)]
         if data.snapshots is not None:
             count, before = config.geometry_snapshots, (motion, covariance, widths)
@@ -405,7 +399,8 @@ def frequencies_apart(frequency_hz: Float[np.ndarray, " n"]) -> list[float]:
 
 def _widths(motion: Motion, shift: float, receiver: tuple[float, float]) -> Motion:
     """Returns the prior standard deviations of all components of a motion."""
-    far = {"shift": shift, "turn": TURN, "receiver": receiver[0], "receiver_turn": receiver[1]}
+    turn = 1e-3  # prior standard deviation (radians) of the rotation of surfaces
+    far = {"shift": shift, "turn": turn, "receiver": receiver[0], "receiver_turn": receiver[1]}
     return Motion(**{name: jnp.full_like(getattr(motion, name), width) for name, width in far.items()})
 
 

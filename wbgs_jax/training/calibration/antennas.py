@@ -171,8 +171,6 @@ def gains_of_chosen(scores: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " n"]
     return gains
 
 
-ROUNDS = 20
-"""Iterations of least squares."""
 FEWEST = 32
 """Minimum number of snapshots of a receiver; with fewer its array is not calibrated."""
 SURE = 3.0
@@ -242,7 +240,8 @@ def least_squares(
     usable = np.isfinite(power) & (power > 0)
     x, y = (part[usable].astype(complex) / np.sqrt(_power(part[usable]))[:, None] for part in (predicted, measured))
     gains = np.ones(predicted.shape[1], complex)
-    for _ in range(ROUNDS if len(x) else 0):
+    rounds = 20  # iterations of least squares
+    for _ in range(rounds if len(x) else 0):
         tuned = gains * x
         factor = np.sum(tuned.conj() * y, 1) / np.maximum(_power(tuned), np.finfo(float).tiny)
         left = _power(y - factor[:, None] * tuned)

@@ -38,8 +38,6 @@ from wbgs_jax.training.calibration.objective import CalibrationProblem, Compared
 from wbgs_jax.training.calibration.obstacles import each_by_itself, of_air
 from wbgs_jax.training.hooks import Say, silent
 
-LARGEST_M = 4.0
-"""Largest extent of an object that is moved as one; larger bodies are parts of the building."""
 CLOSED = 1e-3
 """Largest sum of area vectors of a closed surface, relative to its area."""
 DRAWS = 4000
@@ -59,11 +57,6 @@ RINGS_M, DIRECTIONS = (0.45, 0.9), 8
 """Distances of the places that are tried, nearby and further away, and their number at each."""
 BEGIN_STD_M, FIRST_STEP_M, LAST_STEP_M = 0.2, 0.24, 0.015
 """Position uncertainty with which these are compared, and the first and the last step of the refinement."""
-STDS_M = 0.2, 0.03, 0.0075
-"""Position uncertainties with which an object in its place is compared with itself elsewhere: an uncertain object often fits
-better than a certain one, even where nothing has changed."""
-MOST_CHANGES = 12
-"""Maximum number of changes."""
 
 
 class Group(IntEnum):
@@ -131,9 +124,11 @@ def objects_of(field: Calibratable) -> list[Int[np.ndarray, " _"]]:
     facets = jax.tree.map(np.asarray, field.facets)
     area_vectors, size = facets.normal * areas(facets)[:, None], areas(facets)
 
+    largest_m = 4.0  # largest extent of an object that is moved as one; larger bodies are parts of the building
+
     def movable(own: Bool[np.ndarray, " f"]) -> bool:
         closed = np.linalg.norm(area_vectors[own].sum(0)) < CLOSED * size[own].sum()
-        return bool(closed and np.ptp(facets.corners[own].reshape(-1, 3), axis=0).max() <= LARGEST_M)
+        return bool(closed and np.ptp(facets.corners[own].reshape(-1, 3), axis=0).max() <= largest_m)
 
     found = []
     for body in np.unique(facets.body):
@@ -346,7 +341,11 @@ def find_changes(
     """
     now, changes = Trial(problem.field, params, problem.prepared, _scores(problem, params)), list[Change]()
     names = list(range(len(objects_of(problem.field))))
-    for _ in range(MOST_CHANGES):
+    # Position uncertainties with which an object in its place is compared with itself elsewhere: an uncertain object often
+    # fits better than a certain one, even where nothing has changed
+    stds_m = 0.2, 0.03, 0.0075
+    most_changes = 12  # maximum number of changes
+    for _ in range(most_changes):
         objects = objects_of(now.field)
         here = dataclasses.replace(problem, field=now.field, prepared=now.prepared)
         if not len(objects):
@@ -364,7 +363,7 @@ def find_changes(
         if offset is not None:
             say("place of the object")
             best, offset = _refined(here, now, movers, offset)
-        in_place = [now.score.mean(), *(_scores(here, _uncertain(now.params, movers, std)).mean() for std in STDS_M)]
+        in_place = [now.score.mean(), *(_scores(here, _uncertain(now.params, movers, std)).mean() for std in stds_m)]
         gain = float(min(in_place) - best.score.mean())
         if gain <= limit:
             break

@@ -31,20 +31,9 @@ from wbgs_jax.radio.geometry import rotation_matrix
 from wbgs_jax.training.batches import TrainingData
 from wbgs_jax.types import Links, Receiver
 
-ROUNDS = 3
-"""Gauss-Newton steps at every frequency."""
-AT_ONCE = 8
-"""Number of snapshots that are processed together."""
-ALIKE = 30.0
-"""Number of snapshots that carry as much information as one with independent errors: errors that positions cannot explain
-(wrong materials, missing paths) are correlated between snapshots."""
-LONGEST_STEP = 0.1
-"""Longest step, in wavelengths of the highest frequency; beyond it, phases are not linear."""
 MOST = 256
 """Maximum number of rigid bodies that are adjusted, since the cost of a step is quadratic in it. The others stay at their
 positions with the uncertainty of the prior."""
-ARM = 3.0
-"""Distance from the centre of a surface, metres, at which a rotation displaces it as far as a shift."""
 
 
 def adjust(
@@ -81,14 +70,20 @@ def adjust(
     known = jnp.asarray(covariance, jnp.float32), jnp.asarray(others, jnp.float32)
     variance = length_variances(prepared, *known, numbers, len(motion.shift))
     frequency = np.asarray(data.links.frequency_hz)[pool].max()
-    furthest = LONGEST_STEP * SPEED_OF_LIGHT / float(frequency) / _arms(motion)[numbers]
-    for _ in range(ROUNDS):
-        blocks = -(-min(count, len(pool)) // AT_ONCE)
-        some = np.zeros((-(-count // AT_ONCE), AT_ONCE), np.int32)  # the shape is independent of the pool: compiled once
-        some[:blocks] = rng.choice(pool, (blocks, AT_ONCE))
+    longest_step = 0.1  # longest step, in wavelengths of the highest frequency; beyond it, phases are not linear
+    furthest = longest_step * SPEED_OF_LIGHT / float(frequency) / _arms(motion)[numbers]
+    rounds = 3  # Gauss-Newton steps at every frequency
+    at_once = 8  # number of snapshots that are processed together
+    # Number of snapshots that carry as much information as one with independent errors: errors that positions cannot explain
+    # (wrong materials, missing paths) are correlated between snapshots
+    alike = 30.0
+    for _ in range(rounds):
+        blocks = -(-min(count, len(pool)) // at_once)
+        some = np.zeros((-(-count // at_once), at_once), np.int32)  # the shape is independent of the pool: compiled once
+        some[:blocks] = rng.choice(pool, (blocks, at_once))
         now = back(jnp.asarray(moves, jnp.float32))
         equations = normal_equations(field, params, now, prepared, data, some, variance, np.int32(blocks), numbers)
-        curvature, pull = (np.asarray(a, np.float64) / ALIKE for a in equations)
+        curvature, pull = (np.asarray(a, np.float64) / alike for a in equations)
         precision = curvature + np.diag(stiffness)
         step = np.linalg.solve(precision, pull - stiffness * (start + moves[numbers]))
         moves[numbers] += np.clip(step, -furthest, furthest)
@@ -115,7 +110,8 @@ def _places(numbers: Int[Array, " q"], size: int) -> Int[Array, " p"]:
 def _arms(motion: Motion) -> Float[np.ndarray, " p"]:
     """Returns the displacement (metres) per unit (metre or radian) of every component of a motion."""
     one = jax.tree.map(np.ones_like, motion)
-    return np.asarray(ravel_pytree(Motion(one.shift, ARM * one.turn, one.receiver, one.receiver_turn))[0])
+    arm = 3.0  # distance from the centre of a surface, metres, at which a rotation displaces it as far as a shift
+    return np.asarray(ravel_pytree(Motion(one.shift, arm * one.turn, one.receiver, one.receiver_turn))[0])
 
 
 @partial(jax.jit, static_argnames=("movers", "size"))

@@ -171,8 +171,6 @@ def _with(leaf: Float[Array, " m"], index: int, value: float | None) -> Float[Ar
     return jnp.asarray(copy)
 
 
-SHEETS = (0.002, 0.004, 0.006, 0.01, 0.015)
-"""Thicknesses of sheets that are thinner than a step at the first frequency, metres."""
 THINNEST, THICKEST = 5e-4, 0.35
 """Range of thicknesses, metres."""
 FIRST_STEP, STEP = 1 / 6, 1 / 8
@@ -181,10 +179,6 @@ MOST = 40
 """Maximum number of thicknesses per entry at the first frequency, in addition to sheets."""
 APART = 1.25
 """Minimum ratio of two successive frequencies."""
-ACCURATE = 0.1
-"""position_std, in wavelengths, beyond which phases contain no information about thicknesses."""
-FEWER = 3
-"""A third of the first spectra (`thickness_glance`) is used to select the third of many slabs scored on all of them."""
 ONCE_MORE = 60
 """Number of slabs that are tried again after a pass over all materials or a displacement of surfaces: the best ones on the
 first few spectra."""
@@ -251,7 +245,8 @@ def _sized(
 ) -> tuple[WaveParams, Likely]:
     """Returns parameters with materials and thicknesses estimated at successively higher frequencies, and the likely slabs."""
     materials, spread = np.flatnonzero(unknown).tolist(), float(jnp.exp(jnp.median(params.placement)))
-    first, *others = frequencies_to_look_at(problem.frequency_hz(), ACCURATE * SPEED_OF_LIGHT / spread)
+    accurate = 0.1  # position_std, in wavelengths, beyond which phases contain no information about thicknesses
+    first, *others = frequencies_to_look_at(problem.frequency_hz(), accurate * SPEED_OF_LIGHT / spread)
     likely = dict(likely or {m: _all_slabs(first) for m in materials})
     score = problem.scores(config.thickness_spectra, compared, first)
     for _ in range(2):
@@ -285,8 +280,10 @@ def frequencies_to_look_at(frequency_hz: Float[np.ndarray, " n"], believed_hz: f
 def _all_slabs(frequency_hz: float) -> list[Slab]:
     """Returns all entries of the list with all thicknesses that can be distinguished at a frequency."""
     found = []
+    # Thicknesses of sheets that are thinner than a step at the first frequency, metres
+    sheets = (0.002, 0.004, 0.006, 0.01, 0.015)
     for name in ITU_MATERIALS:
-        found += [Slab(name, float(metres)) for metres in (*SHEETS, *_steps(name, frequency_hz)[:MOST])]
+        found += [Slab(name, float(metres)) for metres in (*sheets, *_steps(name, frequency_hz)[:MOST])]
     return found
 
 
@@ -314,9 +311,11 @@ def _wavelength(entry: str, frequency_hz: float) -> float:
 def _best(params: WaveParams, material: int, slabs: list[Slab], score: Scores, glance: int) -> tuple[WaveParams, list[Slab]]:
     """Returns parameters with the best of some slabs for a material, and the likely slabs, the best first. The material is
     unchanged if its current properties fit better, or if it has no effect."""
-    few, left = len(slabs) // FEWER, slabs
+    # A third of the first spectra (`thickness_glance`) is used to select the third of many slabs scored on all of them
+    fewer = 3
+    few, left = len(slabs) // fewer, slabs
     if few > ONCE_MORE:
-        left = _ranked(params, material, slabs, score, -(-glance // FEWER))[:few] or slabs
+        left = _ranked(params, material, slabs, score, -(-glance // fewer))[:few] or slabs
     likely = _ranked(params, material, left, score, glance)[:ONCE_MORE]
     if not likely:
         return params, slabs

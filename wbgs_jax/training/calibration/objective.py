@@ -39,14 +39,8 @@ AT_ONCE = 8
 """Number of spectra that are scored together."""
 MOST = 32
 """Maximum number of candidates that one call of a program scores."""
-POWER_MARGIN_DB = 1.0
-"""Error of received power that is added before the logarithm, so that accidental agreement has little effect."""
-RAREST = 1e-4
-"""Smallest probability that SciPy's 9,999 random sign flips can resolve."""
 FEWEST_SURE = 5
 """Minimum number of transmitters for significance: the signs of three are all positive by chance in one of eight cases."""
-ALIKE = 1e-6
-"""Mean absolute error of spectra below which all candidates are equally good."""
 Compared = Literal["snapshots", "covariances", "spectra", "powers"]
 """The compared quantity: "snapshots" with exact phases (log decorrelation); "covariances" for the negative log-likelihood of
 snapshots given the uncertainty of phases (`losses.surprise`); "spectra" (log mean absolute error), which is also used if there
@@ -237,14 +231,19 @@ def _compare(
     def by_snapshots() -> Float[Array, ""]:
         return log_decorrelation(snapshots_of(plan, arrived, frequency_hz), batch.snapshots)[0]
 
+    alike = 1e-6  # mean absolute error of spectra below which all candidates are equally good
+
     def by_spectra(pas: Float[Array, "1 90 360"]) -> Float[Array, ""]:
         assert batch.pas is not None, "data without spectra are compared by powers"
-        unlike = jnp.log(jnp.maximum(jnp.mean(jnp.abs(pas - batch.pas)), ALIKE))
+        unlike = jnp.log(jnp.maximum(jnp.mean(jnp.abs(pas - batch.pas)), alike))
         return jnp.where(jnp.max(batch.pas) > 0, unlike, 0)
+
+    # Error of received power that is added before the logarithm, so that accidental agreement has little effect
+    power_margin_db = 1.0
 
     def by_powers(power: Float[Array, " 1"]) -> Float[Array, ""]:
         assert batch.received_db is not None, "data without powers are compared by spectra"
-        unlike = jnp.log(POWER_MARGIN_DB + jnp.abs(decibels(power) - batch.received_db)[0])
+        unlike = jnp.log(power_margin_db + jnp.abs(decibels(power) - batch.received_db)[0])
         return unlike if batch.snapshots is None else jnp.where(jnp.any(batch.snapshots != 0), unlike, 0)
 
     def by_second_moments() -> Float[Array, ""]:
@@ -285,7 +284,8 @@ def surely_better(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"
     by_tx = by_transmitter(gains, tx_index)
     if len(by_tx) < FEWEST_SURE or not np.isfinite(by_tx).all():
         return False
-    if norm.sf(errors) < RAREST:
+    rarest = 1e-4  # smallest probability that SciPy's 9,999 random sign flips can resolve
+    if norm.sf(errors) < rarest:
         gain, error = standard_error(gains, tx_index)
         return gain > errors * error
     chance = permutation_test((by_tx,), np.mean, permutation_type="samples", alternative="greater", random_state=0).pvalue

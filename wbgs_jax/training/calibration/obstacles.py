@@ -46,10 +46,6 @@ MOST = 512
 """Maximum number of rigid bodies that are tested, those with the largest facets."""
 CLOSELY = 32
 """Number of rigid bodies that are tested on all spectra: those without which the first few fit best."""
-ACCURATE = 0.1
-"""Displacement, in wavelengths, up to which a body fits better than none."""
-LEAST = 1e-3
-"""Minimum gain (natural logarithm of the decorrelation) for the removal of a body."""
 SURE, SURE_OF_ONE = 2.0, 2.5
 """n_sigma: standard errors over transmitters by which the gain of a pass must be significant (`surely_better`), and that of a
 single body, which is higher since there are many."""
@@ -112,7 +108,8 @@ def _explained(params: WaveParams, problem: CalibrationProblem, config: Calibrat
 def absent_movers(params: WaveParams, problem: CalibrationProblem, config: CalibrationConfig) -> Int[np.ndarray, " k"]:
     """Returns the rigid bodies without which snapshots fit significantly better, each tested without the previous ones; never
     all bodies."""
-    highest = ACCURATE * SPEED_OF_LIGHT / max(config.geometry_width, 1e-9)
+    accurate = 0.1  # displacement, in wavelengths, up to which a body fits better than none
+    highest = accurate * SPEED_OF_LIGHT / max(config.geometry_width, 1e-9)
     low = problem.frequency_hz() <= highest
     if not low.any():
         return np.zeros(0, int)
@@ -126,11 +123,12 @@ def absent_movers(params: WaveParams, problem: CalibrationProblem, config: Calib
     likely = [tried[i] for i in np.argsort(-gains.mean(1))[:CLOSELY] if gains[i].mean() > 0]
     now, gone = score([params])[0], list[int]()
     closely = (now - score([of_air(params, one) for one in likely])).mean(1) if likely else np.zeros(0)
+    least = 1e-3  # minimum gain (natural logarithm of the decorrelation) for the removal of a body
     for one in np.array(likely, int)[np.argsort(-closely)].tolist():
         without = of_air(params, one)
         scores = score([without])[0]
         gain = now - scores
-        if gain.mean() > LEAST and surely_better(gain, tx, SURE_OF_ONE) and len(gone) + 1 < len(first):
+        if gain.mean() > least and surely_better(gain, tx, SURE_OF_ONE) and len(gone) + 1 < len(first):
             params, now = without, scores
             gone.append(one)
     return np.sort(np.array(gone, int))
@@ -161,17 +159,11 @@ def _carried(params: WaveParams, field: Calibratable) -> WaveParams:
     return replaced(field.init(jax.random.key(0)), **{name: getattr(params, name) for name in ("materials", *ENDS)})
 
 
-JUDGES = 0.25
-"""Fraction of the transmitters on whose spectra the absorption grid is tested."""
 FEWEST = 6
 """Minimum number of these transmitters; fewer are never significant."""
 SURE_OF_CLUTTER = 1.0
 """n_sigma: standard errors over transmitters by which the gain must be significant (`surely_better`). It is low, since a grid
 that is not needed makes other spectra fit worse, and does no harm otherwise."""
-LEAST_CLUTTER = 2e-4
-"""Minimum reduction of the mean absolute error; spectra are at most 1."""
-BATCH = 8
-"""Links per step."""
 PARTS = 4
 """Parts of the fit: after the first one, a grid with which other spectra fit worse is given up."""
 
@@ -201,12 +193,14 @@ def search_clutter(
     """
     tx = problem.tx_index()
     everyone = rng.permutation(np.unique(tx))
-    testers = everyone[: round(JUDGES * len(everyone))]
+    judges = 0.25  # fraction of the transmitters on whose spectra the absorption grid is tested
+    testers = everyone[: round(judges * len(everyone))]
     if len(testers) < FEWEST:
         return params, problem, None
     of_testers = np.isin(tx, testers)
     held_out = dataclasses.replace(problem, spectra=problem.spectra[of_testers][: config.absorption_spectra])
-    batches = batches_of_one_receiver(problem.data, problem.spectra[~of_testers], config.absorption_steps, BATCH, rng)
+    batch = 8  # links per step
+    batches = batches_of_one_receiver(problem.data, problem.spectra[~of_testers], config.absorption_steps, batch, rng)
     field = problem.field.with_absorption()
     others, fuller = replaced(params, clutter=field.first_clutter), dataclasses.replace(problem, field=field)
     state = _optimizer(field, len(batches)).init(field.first_clutter)
@@ -218,7 +212,8 @@ def search_clutter(
             if np.mean(after) >= np.mean(before):
                 break
     gains = before - after
-    taken = bool(gains.mean() > LEAST_CLUTTER) and surely_better(gains, held_out.tx_index(), SURE_OF_CLUTTER)
+    least_clutter = 2e-4  # minimum reduction of the mean absolute error; spectra are at most 1
+    taken = bool(gains.mean() > least_clutter) and surely_better(gains, held_out.tx_index(), SURE_OF_CLUTTER)
     report = ClutterReport(float(before.mean()), float(after.mean()), taken)
     return (others, fuller, report) if taken else (params, problem, report)
 

@@ -70,19 +70,16 @@ def search_idealisations(
     return params, found
 
 
-GAINS_DB = (100.0, 5.0), (5.0, 0.5)
-"""Successive ranges of the gain about the previous value, and steps within them, dB."""
 ROOMS_DB = -40.0, 10.0
 """Plausible range of the median received power relative to free space, dB. Snapshots outside it are in another unit, like
 measured voltages; smaller deviations are corrected by gradients."""
-SWEEPS = 2
-"""Maximum number of times that antennas are calibrated again after materials have been chosen."""
 
 
 def search_gain(params: WaveParams, score: Scores, gain: float = 0.0) -> tuple[WaveParams, float]:
     """Returns parameters with the overall gain that fits received powers best, and that gain (dB); the transmitted power may be
     unknown. The search begins at `gain` (dB)."""
-    for reach, step in GAINS_DB:
+    gains_db = (100.0, 5.0), (5.0, 0.5)  # successive ranges of the gain about the previous value, and steps within them, dB
+    for reach, step in gains_db:
         tried = gain + np.arange(-reach, reach + step, step)
         candidates = [dataclasses.replace(params, log_gain=jnp.asarray(db * np.log(10) / 20, jnp.float32)) for db in tried]
         best = int(np.argmin(score(candidates).mean(1)))
@@ -144,6 +141,7 @@ class Calibration(Hook):
         if config.antenna_rounds:
             say("calibration: antenna patterns")
             params, _ = self._antennas(params, problem, report)
+        sweeps = 2  # maximum number of times that antennas are calibrated again after materials have been chosen
         if config.rounds:
             say("calibration: materials of the surfaces")
             params, named, _ = search_slabs(params, problem, config, config.spectra)
@@ -156,7 +154,7 @@ class Calibration(Hook):
                     params, named, _ = search_slabs(params, problem, config, config.spectra)
                     report["search"] = dataclasses.asdict(named)
             say("calibration: delay by walls, curvature of waves")
-            for _ in range(SWEEPS):
+            for _ in range(sweeps):
                 params = self._idealisations(params, problem, report)
                 params, changed = self._antennas(params, problem, report) if config.antenna_rounds else (params, False)
                 if not changed:
