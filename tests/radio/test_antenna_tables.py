@@ -182,6 +182,7 @@ def msi(gain="17.85 dBi", tilt=6):
     [
         *[("17.85 dBi", 17.85), ("15.70 dBd", 17.85), ("15.7", 17.85)],
         *[("15.7 dBd (17.85 dBi)", 17.85), ("17.85 (dBi) 15.7 (dBd)", 17.85), ("17.85dBi", 17.85), ("15,7 dBd", 17.85)],
+        *[("18. dBi", 18.0), ("1.785E+01 dBi", 17.85), ("+1.57e1", 17.85)],
     ],
 )
 @pytest.mark.parametrize("end", ["\n", "\r\r\n"])
@@ -283,6 +284,7 @@ def test_repeated_directions_have_one_value(tmp_path):
         ("a.csv", "azimuth_deg,zenith_deg,gain_dbi\n0,0,100\n", "beyond 80 dBi"),
         ("a.pln", "NAME x\nGAIN 3\n", "not an MSI Planet file"),
         ("a.msi", msi().replace("\n90 ", "\n91 "), "not an MSI Planet file"),
+        ("a.msi", msi("17.85 dB"), "needs GAIN in dBd or dBi"),
     ],
 )
 def test_a_wrong_file_is_one_line(tmp_path, name, text, words):

@@ -130,8 +130,8 @@ def _read_msi(path: Path) -> Antenna:
         horizontal, vertical = (_cut(lines, name) for name in ("HORIZONTAL", "VERTICAL"))
     except (KeyError, IndexError, ValueError):
         raise UserError(
-            f"{path} is not an MSI Planet file; it needs GAIN, and below HORIZONTAL 360 and VERTICAL 360 360 lines each of "
-            "an angle and an attenuation"
+            f"{path} is not an MSI Planet file; it needs GAIN in dBd or dBi, and below HORIZONTAL 360 and VERTICAL 360 360 "
+            "lines each of an angle and an attenuation"
         ) from None
     least_db = -0.5  # smallest attenuation, for rounding and a maximum between two degrees
     if (lowest := min(horizontal.min(), vertical.min())) < least_db:
@@ -152,12 +152,13 @@ def _read_msi(path: Path) -> Antenna:
 
 
 def _gain_dbi(text: str) -> float:
-    """Returns the first gain in a text (dBi), which may have a decimal comma; it is in dBd unless dBi follows the number."""
+    """Returns the first gain in a text (dBi), which may have a decimal comma; a number alone is in dBd. Other units, and what
+    is no number, raise a `ValueError`."""
     dipole_dbi = 2.15  # gain of a half-wave dipole, the reference of dBd
-    found = re.match(r"([-+]?\d+(?:[.,]\d+)?)[\s([]*(dBi)?", text, re.IGNORECASE)
+    found = re.match(r"([-+\d.,e]+)(?:[\s([]*(dB[id])\b|$)", text, re.IGNORECASE)
     if found is None:
-        raise ValueError("a gain that is not a number")
-    return float(found[1].replace(",", ".")) + (0.0 if found[2] else dipole_dbi)
+        raise ValueError("a gain that is not a number in dBd or dBi")
+    return float(found[1].replace(",", ".")) + (0.0 if (found[2] or "").lower() == "dbi" else dipole_dbi)
 
 
 def _cut(lines: list[list[str]], name: str) -> Float[np.ndarray, "360"]:
