@@ -130,6 +130,25 @@ def test_a_moving_mirror_shifts_by_two_v_over_lambda():
 
 
 @pytest.mark.heavy
+def test_a_turning_mirror_flashes():
+    """A small mirror far from both ends reflects for a few of all instants, in the midst of its turn."""
+    plate = rectangle((0, -0.25, -0.25), (0, 0.5, 0), (0, 0, 0.5))
+    rx, tx, count = np.array([5.0, 3.0, 0.0]), np.array([6.0, 2.0, 0.0]), 101
+    field, params, _ = field_of([plate], rx, **SMALL | {"mirror_areas": (0.0,)})
+    angle = np.linspace(0, 1, count)
+    normal, across = (np.stack([np.cos(a), np.sin(a), 0 * a], -1) for a in (angle, angle + np.pi / 2))
+    image = rx - 2 * (normal @ rx)[:, None] * normal
+    share = normal @ tx / ((normal @ tx) - np.sum(normal * image, -1))
+    expected = np.abs(np.sum((tx + share[:, None] * (image - tx)) * across, -1)) < 0.25
+    motion = make_movement(field, count, turn={0: angle[:, None] * [0, 0, 1]})
+    plan = plan_movement(field, params, make_receiver(rx), tx, motion)
+    found = paths_over_time(params, plan, make_query(np.broadcast_to(tx, (count, 3)), 3e9), motion)
+    reflected = (np.asarray(found.interaction)[:, :, 0] == 2) & (np.abs(np.asarray(found.amplitude)) > 0)
+    assert 5 < expected.sum() < 12
+    np.testing.assert_array_equal(reflected.any(-1), expected)
+
+
+@pytest.mark.heavy
 def test_nothing_jumps_while_paths_remain(rng):
     """A person walks across a link: the amplitude of no path jumps, and phases follow lengths."""
     field, params, _ = field_of(PARTS, RX, **SMALL)

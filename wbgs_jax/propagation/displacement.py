@@ -286,7 +286,7 @@ def tree_over_time(
         The tree at the nominal positions; `tree_at` moves it.
     """
     rx = np.asarray(receiver_position, np.float64)
-    instants = _instants(facets, tx_position, motion)
+    instants = _instants(facets, rx, tx_position, motion)
     movement = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64)[instants], motion)
     sequences, after = [], []
     for number in range(len(instants)):
@@ -335,14 +335,15 @@ def _ever_valid(tree: ImageTree, tx_position: Float[Array, "t 3"], motion: Motio
     return jax.tree.map(lambda mask: mask.any(0), found)
 
 
-def _instants(facets: Facets, tx_position: Float[AnyArray, "t 3"], motion: Motion) -> Int[np.ndarray, " n"]:
-    """Returns instants between which nothing moves by more than `STEP_M`: the first, the last, and some in between."""
-    bodies = motion.shift.shape[1]
-    arms = np.linalg.norm(
-        np.asarray(facets.corners) - np.asarray(centres(facets, bodies))[np.asarray(facets.mover)][:, None], axis=-1
-    )
-    radius = np.zeros(bodies)
-    np.maximum.at(radius, np.asarray(facets.mover), arms.max(1))
+def _instants(
+    facets: Facets, rx: Float[np.ndarray, "3"], tx_position: Float[AnyArray, "t 3"], motion: Motion
+) -> Int[np.ndarray, " n"]:
+    """Returns instants between which nothing moves by more than `STEP_M`: the first, the last, and some in between. A body that
+    turns moves whatever is seen in it, up to the farthest corner of the box around surfaces and ends of the link."""
+    middles = np.asarray(centres(facets, motion.shift.shape[1]))
+    ends = np.asarray(tx_position), rx + np.asarray(motion.receiver), np.asarray(facets.corners).reshape(-1, 3)
+    low, high = (reach(np.concatenate(ends), axis=0) for reach in (np.min, np.max))
+    radius = np.linalg.norm(np.maximum(high - middles, middles - low), axis=-1)
     places = motion.shift, motion.turn, motion.receiver, tx_position
     shift, turn, receiver, tx = (np.linalg.norm(np.diff(np.asarray(a, np.float64), axis=0), axis=-1) for a in places)
     furthest = np.maximum((shift + radius * turn).max(1, initial=0), np.maximum(receiver, tx))
