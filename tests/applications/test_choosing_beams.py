@@ -63,3 +63,10 @@ def test_beams_for_transmitters_are_those_of_their_spectra(rng):
         return spectra[(np.asarray(tx_position)[:, 0] / 3).astype(int)]
 
     np.testing.assert_array_equal(choose_beams(predict, positions, 28e9), rank_beams(spectra))
+
+
+def test_spectra_of_eight_bits_rank_like_their_values(rng):
+    """Unsigned integers, as in an image, have no negative: a dark beam would count as the brightest."""
+    image = rng.integers(0, 256, (4, 90, 360)).astype(np.uint8)
+    np.testing.assert_array_equal(rank_beams(image), rank_beams(image.astype(float)))
+    assert score_beams(image, image) == score_beams(image.astype(float), image.astype(float))

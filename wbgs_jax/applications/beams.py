@@ -46,7 +46,7 @@ def rank_beams(spectra: Any, count: int = 3) -> Int[np.ndarray, "n count"]:
         raise ValueError(f"spectra have shape {values.shape}; pass (n, 90, 360)")
     if not 1 <= count <= len(beams):
         raise ValueError(f"count is {count}; give 1 to {len(beams)} beams")
-    received = values.reshape(-1, 90 * 360)[:, beams]
+    received = values.reshape(-1, 90 * 360)[:, beams].astype(float)  # unsigned integers of an image have no negative
     return np.argsort(-received, axis=1, kind="stable")[:, :count]
 
 
@@ -78,7 +78,7 @@ def score_beams(predicted: Any, truth: Any) -> BeamScores:
     Raises:
         ValueError: the numbers of spectra differ, or some values are not finite.
     """
-    predicted, truth = np.asarray(predicted), np.asarray(truth)
+    predicted, truth = np.asarray(predicted, float), np.asarray(truth, float)
     if predicted.shape != truth.shape:
         raise ValueError(
             f"predicted spectra have shape {predicted.shape}, true ones {truth.shape}; pass those of the same links"
