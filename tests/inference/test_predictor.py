@@ -202,6 +202,8 @@ def test_blocks_refuse_positions_that_are_none():
     for several in (predict_blocks, predict_many):
         with pytest.raises(ValueError, match="block is 0; give at least 1"):
             several(Recorder(), np.zeros((4, 3)), 2e9, block=0)
+        with pytest.raises(ValueError, match="expected \\(n, 3\\)"):  # frequencies would be paired with the wrong axis
+            several(Recorder(), np.zeros((2, 2, 3)), 2e9, block=2)
 
 
 def test_no_places_have_no_spectra(predict):

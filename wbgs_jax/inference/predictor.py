@@ -391,7 +391,10 @@ def predict_many(
 def _positions(tx_positions: Any) -> Float[np.ndarray, "n d"]:
     """Returns positions, of which there may be one or none."""
     positions = np.asarray(tx_positions, np.float32)
-    return np.atleast_2d(positions) if positions.size else np.zeros((0, 3), np.float32)
+    positions = np.atleast_2d(positions) if positions.size else np.zeros((0, 3), np.float32)
+    if positions.ndim != 2:
+        raise ValueError(f"tx_positions have shape {positions.shape}; expected (n, 3)")
+    return positions
 
 
 def map_queries(
