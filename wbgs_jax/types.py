@@ -363,6 +363,8 @@ def check_query(query: Query) -> None:
     frequency, position = concrete(query.frequency_hz), concrete(query.tx_position)
     if frequency is not None and frequency.size and not frequency.min() >= LOWEST_OF_PATHS_HZ:
         raise ValueError(f"frequency_hz is {frequency.min():g}; frequencies are in hertz (2.4e9 for 2.4 GHz) and positive")
+    if frequency is not None and not np.isfinite(frequency).all():
+        raise ValueError("frequency_hz is infinite; frequencies are in hertz (2.4e9 for 2.4 GHz) and finite")
     if position is not None and position.size and not np.abs(position).max() <= LARGEST_COORDINATE_M:
         raise ValueError(f"tx_position is {np.abs(position).max():g}; positions are in metres and finite")
 

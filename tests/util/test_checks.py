@@ -57,6 +57,7 @@ def no_type_checks():
         (np.zeros((1, 3), np.float32), np.full(1, 2.4, np.float32), ValueError, "in hertz"),
         (np.zeros((1, 3), np.float32), np.full(1, -1e9, np.float32), ValueError, "in hertz"),
         (np.zeros((1, 3), np.float32), np.full(1, np.nan, np.float32), ValueError, "in hertz"),
+        (np.zeros((1, 3), np.float32), np.full(1, np.inf, np.float32), ValueError, "infinite"),
         (np.full((1, 3), 3e6, np.float32), np.full(1, 1e9, np.float32), ValueError, "in metres"),
         (np.full((1, 3), np.nan, np.float32), np.full(1, 1e9, np.float32), ValueError, "in metres"),
     ],
