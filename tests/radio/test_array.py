@@ -1,5 +1,7 @@
 """The array model against closed forms and a plain loop."""
 
+import inspect
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -204,3 +206,11 @@ def test_of_nothing_there_is_nothing_to_see():
     assert not np.any(wide_covariance_to_pas(nothing, jnp.asarray(planar_array(), jnp.float32)[None]))
     slope = jax.grad(lambda r: jnp.sum(covariance_to_pas(r * (1 + 0j), make_lag_basis(planar_array()))))(nothing.real)
     assert np.isfinite(slope).all()
+
+
+def test_positions_keep_their_fractions_beside_whole_numbers():
+    """A snapshot of integers, or of half precision, does not round the positions of the elements to its own type."""
+    elements = planar_array()
+    expected, unchecked = snapshot_to_pas(jnp.ones(16, jnp.complex64), elements), inspect.unwrap(snapshot_to_pas)
+    for dtype in (np.int32, jnp.bfloat16):
+        np.testing.assert_allclose(unchecked(jnp.ones(16, dtype), elements), expected, atol=1e-5)

@@ -146,6 +146,7 @@ def snapshot_to_pas(
         Spectra (*n, 90, 360), amplitudes.
     """
     snapshot = jnp.asarray(snapshot)
+    snapshot = snapshot.astype(jnp.promote_types(snapshot.dtype, jnp.complex64))
     positions = jnp.asarray(element_positions, snapshot.real.dtype)
     if positions.ndim == 3:
         return jax.vmap(snapshot_to_pas)(snapshot, positions)
