@@ -214,3 +214,8 @@ def test_positions_keep_their_fractions_beside_whole_numbers():
     expected, unchecked = snapshot_to_pas(jnp.ones(16, jnp.complex64), elements), inspect.unwrap(snapshot_to_pas)
     for dtype in (np.int32, jnp.bfloat16):
         np.testing.assert_allclose(unchecked(jnp.ones(16, dtype), elements), expected, atol=1e-5)
+
+
+def test_of_no_spectra_there_are_no_errors():
+    none = np.zeros((0, 90, 360))
+    assert array.peak_direction_error(none, none, planar_array()).shape == (0,)

@@ -316,7 +316,7 @@ def _peak_angle(
 ) -> Float[Array, "*b"]:
     """Returns the angle between strongest directions (degrees), up to the components that an array does not resolve."""
     directions = jnp.asarray(_pas_directions().reshape(-1, 3))
-    a, b = (directions[jnp.argmax(pas.reshape(*pas.shape[:-2], -1), -1)] for pas in (predicted, truth))
+    a, b = (directions[jnp.argmax(pas.reshape(*pas.shape[:-2], PAS_HEIGHT * PAS_WIDTH), -1)] for pas in (predicted, truth))
     if across is not None:
         across = jnp.asarray(across, a.dtype)
         (p, q) = (jnp.matmul(direction, across.T, precision=EXACT) for direction in (a, b))
