@@ -221,3 +221,16 @@ def test_normalised_channels_have_the_energy_of_one_sample(rng):
         np.testing.assert_allclose(jnp.sum(jnp.abs(some.taps(BAND, normalize=True)) ** 2, -1), 1, rtol=1e-5)
     silent = arrivals([[0.0, 0.0]], [[3.0, 4.0]])
     assert not silent.cfr(offsets, normalize=True).any() and not silent.taps(BAND, normalize=True).any()
+
+
+def test_of_an_empty_list_of_paths_there_is_no_channel():
+    """Ray tracers return no paths at all, not padding, where nothing arrives."""
+    none = arrivals(np.zeros((2, 0)), np.zeros((2, 0)))
+    assert np.isnan(k_factor_db(none)).all() and np.isnan(delay_spread_s(none)).all()
+    assert np.isnan(channel.angular_spread_deg(none)).all()
+    assert none.cir()[1].shape == (2, 0)
+    assert not none.cfr([0.0, 1e6]).any() and not none.taps(1e6).any()
+
+
+def test_k_factors_of_faint_paths_do_not_underflow():
+    np.testing.assert_allclose(k_factor_db(arrivals([[1e-22, 5e-23]], [[3, 4]])), 10 * np.log10(4), atol=1e-4)

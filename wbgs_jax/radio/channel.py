@@ -62,7 +62,7 @@ class Paths(NamedTuple):
         amplitude = jnp.asarray(self.amplitude)
         valid, tau = amplitude != 0, jnp.asarray(self.length) / SPEED_OF_LIGHT
         if normalize_delays:
-            first = jnp.min(jnp.where(valid, tau, jnp.inf), -1, keepdims=True)
+            first = jnp.min(jnp.where(valid, tau, jnp.inf), -1, keepdims=True, initial=jnp.inf)
             tau = tau - jnp.where(jnp.isfinite(first), first, 0)
         return amplitude, jnp.where(valid, tau, -1)
 
@@ -214,7 +214,8 @@ def k_factor_db(arrivals: Paths) -> Float[Array, "*b"]:
     Returns:
         Decibels (*b,); infinite with a single path, NaN without any.
     """
-    power = squared_magnitude(arrivals.amplitude)
+    power, _ = _shares(arrivals.amplitude)
+    power = jnp.pad(power, [(0, 0)] * (power.ndim - 1) + [(0, 1)])  # one without power: of no paths none is the strongest
     strongest, largest = jnp.max(power, -1), jnp.argmax(power, -1, keepdims=True)
     others = jnp.sum(jnp.where(jnp.arange(power.shape[-1]) == largest, 0, power), -1)
     several = others > 0
@@ -260,7 +261,7 @@ def angular_spread_deg(arrivals: Paths) -> Float[Array, "*b 2"]:
 
 def _shares(amplitude: Any) -> tuple[Float[Array, "*b k"], Bool[Array, "*b"]]:
     """Returns the shares of paths in the power of their link, which add up to 1, and whether there are any paths."""
-    strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(jnp.asarray(amplitude)), -1, keepdims=True))
+    strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(jnp.asarray(amplitude)), -1, keepdims=True, initial=0))
     power = squared_magnitude(amplitude / jnp.where(strongest > 0, strongest, 1))  # those of faint amplitudes would underflow
     total = jnp.sum(power, -1, keepdims=True)
     return power / jnp.where(total > 0, total, 1), total[..., 0] > 0
