@@ -312,7 +312,7 @@ def make_query(
         Positions (b, 3) and frequencies (b,), and the further properties with a leading axis of b where given.
 
     Raises:
-        ValueError: an orientation of zero length.
+        ValueError: an orientation of zero length, or another number of antennas than one or that of the transmitters.
 
     Example:
         >>> make_query([[0.0, 0.0, 1.5], [1.0, 0.0, 1.5]], 28e9).frequency_hz.shape
@@ -339,8 +339,12 @@ def _check_orientation(name: str, orientation: Any) -> None:
 
 
 def repeat_antenna(antenna: Antenna | None, count: int) -> Antenna | None:
-    """Returns an antenna with a leading axis of `count` equal ones, unless it has a leading axis already."""
-    if antenna is None or antenna.exponents.ndim > 1:
+    """Returns an antenna with a leading axis of `count` equal ones, unless it has one of this length already."""
+    if antenna is None:
+        return None
+    if antenna.exponents.ndim > 1:
+        if (stacked := len(antenna.exponents)) != count:
+            raise ValueError(f"antenna is a stack of {stacked} for {count} transmitters; give one for all or one for each")
         return antenna
     repeated: Antenna = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), antenna)
     return repeated

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from wbgs_jax.applications.beams import RIGHT_DB, beam_directions, choose_beams, rank_beams, score_beams
-from wbgs_jax.radio.array import codebook, pas_directions
+from wbgs_jax.applications.beams import RIGHT_DB, choose_beams, rank_beams, score_beams
+from wbgs_jax.radio.array import codebook
 
 
 def test_beams_are_ranked_as_a_search_through_all_of_them_ranks_them(rng):
@@ -20,11 +20,6 @@ def test_spectra_and_counts_are_checked(rng):
     for shape, count, words in (((90, 360), 3, "shape"), ((2, 360, 90), 3, "shape"), ((2, 90, 360), 65, "1 to 64 beams")):
         with pytest.raises(ValueError, match=words):
             rank_beams(np.zeros(shape), count)
-
-
-def test_a_beam_points_where_its_pixel_is(rng):
-    row, column = divmod(int(codebook()[beam := int(rng.integers(64))]), 360)
-    np.testing.assert_array_equal(beam_directions()[beam], pas_directions()[row, column])
 
 
 def test_scores_are_those_of_a_search_through_all_beams(rng):

@@ -65,6 +65,13 @@ def test_a_tabulated_antenna_is_that_of_its_table(setup):
     np.testing.assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
 
 
+def test_a_stack_of_antennas_is_of_as_many_transmitters():
+    stack = Antenna(None, jnp.zeros((3, 2)))
+    assert make_query([TX[0]] * 3, HZ, antenna=stack).transmitter.antenna is stack
+    with pytest.raises(ValueError, match="a stack of 3 for 2 transmitters"):
+        make_query(TX, HZ, antenna=stack)
+
+
 def test_positions_alone_are_transmitters_without_further_properties():
     query = Query(jnp.asarray(TX, jnp.float32), jnp.full(2, HZ))
     assert jax.tree.structure(query) == jax.tree.structure(make_query(TX, HZ))
