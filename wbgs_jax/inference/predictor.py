@@ -38,7 +38,7 @@ def make_predictor(trained: TrainedField, receiver: Receiver | None = None) -> P
 
     The part of the computation that does not depend on the query is done here, once for the receiver. The default is the first
     receiver of the training data, which are read to obtain it; for a receiver that is not in the training data, call
-    `at_receiver` first. The function is compiled for every new number of queries; `batching.predict_many` keeps that number
+    `at_receiver` first. The function is compiled for every new number of queries; `predict_many` keeps that number
     fixed.
 
     Args:
