@@ -81,7 +81,7 @@ def _compute(job: jobs.Job, folder: Path, workers: int, threads: int | None, clu
         received, done = False, list[int]()
         for batch in jobs.run(job, todo, folder, workers, threads, cluster):
             done.append(batch)
-            received = received or jobs.check_heard(job, folder, done)
+            received = received or jobs.check_received(job, folder, done)
             progress.advance()
 
 

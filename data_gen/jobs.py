@@ -166,7 +166,7 @@ def _measure(job: Job, tx: int, paths: list["TxPaths"]) -> Results:
     }
 
 
-def check_heard(job: Job, folder: Path, done: Sequence[int]) -> bool:
+def check_received(job: Job, folder: Path, done: Sequence[int]) -> bool:
     """Returns whether any transmitter of the finished batches has a path.
 
     Raises:

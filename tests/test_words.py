@@ -67,6 +67,8 @@ INSTEAD = {
 """Expressions that are not used, each with what to say instead."""
 STARTS = re.compile(r"(Of|With|Those|That|Whose|How|What) ")
 """Beginnings of docstrings that are no sentences, or hide the subject."""
+NAMES = re.compile(r"(?:^|_)(heard|hears|told|tells|asked|asks|says|said|believed|believes|judges)(?:_|$)")
+"""Parts of the names of variables, functions and attributes that are not used either."""
 CODE = re.compile(r"`[^`]*`|\{[^{}]*\}|\bhttps?://\S+|(?<!\w)(?:--|\.)\w[\w.-]*")
 """Names, options and placeholders within text."""
 NAME = re.compile(r"""[a-zA-Z]*(["'])[\w.-]*\1""")
@@ -93,6 +95,23 @@ def flaws(source: str) -> Iterator[str]:
 
 def modules(place: str) -> list[Path]:
     return sorted((ROOT / place).rglob("*.py")) if (ROOT / place).is_dir() else [ROOT / place]
+
+
+def names(source: str) -> Iterator[str]:
+    """Yields names in a module that have a better one, with their lines."""
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.NAME and NAMES.search(token.string):
+            yield f"{token.start[0]}: {token.string}"
+
+
+@pytest.mark.parametrize("place", CHECKED)
+def test_the_names_in_a_package(place):
+    found = [f"{path.relative_to(ROOT)}:{name}" for path in modules(place) for name in names(path.read_text(encoding="utf-8"))]
+    assert not found, "\n".join(found)
+
+
+def test_names_are_found():
+    assert list(names("power = what_it_heard(told, asking)\n")) == ["1: what_it_heard", "1: told"]
 
 
 @pytest.mark.parametrize("place", CHECKED)

@@ -18,7 +18,7 @@ from wbgs_jax.inference.kriging import (
     member_weights,
     mixed_spectra,
     read_neighbours,
-    without_asked,
+    without_queried,
     write_neighbours,
 )
 from wbgs_jax.training.fit_mixture import Known, start_mixture
@@ -145,6 +145,6 @@ def test_it_comes_back_from_a_run_folder_and_belongs_to_its_receiver(dataset, tm
 
 def test_what_is_scored_is_not_known(dataset):
     mixture = made(dataset)
-    left = without_asked(mixture, dataset.query(dataset.train[:6]))
+    left = without_queried(mixture, dataset.query(dataset.train[:6]))
     np.testing.assert_array_equal(left.images, mixture.images[6:])
     np.testing.assert_allclose(left.mean, np.asarray(mixture.images[6:]).mean(0) / 255, atol=1e-6)

@@ -44,11 +44,13 @@ def by_the_equations(dataset, index, choice, values, position, frequency):
 def test_what_is_scored_is_not_asked(known):
     dataset, index, _, predicted = known
     neighbours = made(Choice("spectra", 1.0, 1.0), dataset, index, predicted)
-    left = kriging.without_asked(neighbours, dataset.query(index[:5]))
+    left = kriging.without_queried(neighbours, dataset.query(index[:5]))
     np.testing.assert_array_equal(left.images, neighbours.images[5:])
     np.testing.assert_allclose(left.tx_position, dataset.tx_positions[index[5:]], rtol=1e-6)
     np.testing.assert_array_equal(left.frequency_hz, neighbours.frequency_hz[5:])
-    assert kriging.without_asked(neighbours, dataset.query(index)) is None is kriging.without_asked(None, dataset.query(index))
+    assert (
+        kriging.without_queried(neighbours, dataset.query(index)) is None is kriging.without_queried(None, dataset.query(index))
+    )
 
 
 @pytest.mark.parametrize("kind", ["residuals", "spectra"])

@@ -221,7 +221,7 @@ def read_arrays(path: Path, what: str, advice: str, names: Collection[str] | Non
 def opened_archive(path: Path, what: str, advice: str) -> Iterator["Archive"]:
     """Yields the arrays of an .npz file, each of which is read on access; otherwise like `read_arrays`."""
     where = f"{what} {path}".strip()
-    with told(where, advice):
+    with reported(where, advice):
         check_file(path, where, advice)
         with path.open("rb") as stream:
             if not zipfile.is_zipfile(stream):
@@ -240,7 +240,7 @@ class Archive(dict[str, np.ndarray]):
         self._archive, self._where, self._advice = archive, where, advice
 
     def __getitem__(self, name: str) -> np.ndarray:
-        with told(f"{self._where}: {name!r}", self._advice):
+        with reported(f"{self._where}: {name!r}", self._advice):
             value = self._archive[name]
             if not isinstance(value, np.ndarray):
                 raise UserError(f"{self._where} has the entry {name[:40]!r}, which is not an array; {self._advice}")
@@ -261,7 +261,7 @@ def check_size(archive: zipfile.ZipFile, path: Path) -> None:
 
 
 @contextlib.contextmanager
-def told(where: str, advice: str) -> Iterator[None]:
+def reported(where: str, advice: str) -> Iterator[None]:
     """Converts any error of a parser to a `UserError` of one line.
 
     Args:
@@ -367,7 +367,7 @@ def read_tree(path: Path, classes: Sequence[type[T]], without: str, before: Mapp
     advice = f"remove it to {without}, or train again"
     arrays = {name: np.asarray(value) for name, value in (before or {}).items()} | read_arrays(path, "", advice)
     fits = (cls for cls in classes if {f.name for f in dataclasses.fields(cls)} == arrays.keys())  # type: ignore[arg-type]
-    with told(str(path), advice):
+    with reported(str(path), advice):
         return next(fits, classes[-1])(**{name: _in_memory(value) for name, value in arrays.items()})
 
 

@@ -152,8 +152,8 @@ def _read_msi(path: Path) -> Antenna:
 
 
 def _gain_dbi(text: str) -> float:
-    """Returns the first gain in a text (dBi), which may have a decimal comma; a number alone is in dBd. Other units, and what
-    is no number, raise a `ValueError`."""
+    """Returns the first gain in a text (dBi), which may have a decimal comma; a number alone is in dBd. Other units, and a
+    text without a number, raise a `ValueError`."""
     dipole_dbi = 2.15  # gain of a half-wave dipole, the reference of dBd
     found = re.match(r"([-+\d.,e]+)(?:[\s([]*(dB[id])\b|$)", text, re.IGNORECASE)
     if found is None:

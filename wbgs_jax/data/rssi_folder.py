@@ -34,7 +34,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import check_file, read_yaml, told
+from wbgs_jax._util.files import check_file, read_yaml, reported
 from wbgs_jax.data.tables import (
     check_frame,
     check_metres,
@@ -103,7 +103,7 @@ def _rssi(path: Path, gateways: list[str] | int) -> Float[np.ndarray, "n r"]:
 
 def _csi(path: Path) -> Float[np.ndarray, "n r"]:
     advice = "it must hold complex numbers (transmitter, antenna, subcarrier)"
-    with told(str(path), advice):
+    with reported(str(path), advice):
         check_file(path, str(path), advice)
         state = np.load(path, allow_pickle=False)
     if not isinstance(state, np.ndarray) or state.ndim != 3 or not np.iscomplexobj(state):

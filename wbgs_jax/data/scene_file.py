@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int, UInt8
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write, read_arrays, safe_name, told
+from wbgs_jax._util.files import atomic_write, read_arrays, reported, safe_name
 from wbgs_jax.observation_kinds import KINDS, HostObservations, Kind, only_kind
 from wbgs_jax.types import LARGEST_COORDINATE_M, LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ, ElementUnit
 
@@ -277,7 +277,7 @@ def load_scene(path: Path | str) -> SceneFile:
     arrays = read_arrays(path, "scene file", advice, {"meta", *ARRAYS, *KINDS, *TEXTS})
     if "meta" not in arrays:
         raise UserError(f"{path} is not a scene file: it lacks meta; create one with `save_scene` (docs/formats.md)")
-    with told(f"meta of scene file {path}", advice):
+    with reported(f"meta of scene file {path}", advice):
         meta = json.loads(str(arrays.pop("meta")))
     found = meta.get("format") if isinstance(meta, dict) else None
     if found not in (1, FORMAT):
@@ -351,7 +351,7 @@ def load_room(path: Path | str) -> Room:
     arrays = read_arrays(path, "room file", advice, {*MESH, "meta"})
     if missing := [name for name in (*MESH, "meta") if name not in arrays]:
         raise UserError(f"{path} is not a room file: it lacks {', '.join(missing)}; {advice}")
-    with told(f"meta of room file {path}", advice):
+    with reported(f"meta of room file {path}", advice):
         meta = json.loads(str(arrays.pop("meta")))
         parts = meta.get("parts", [])
     room = Room(**check_mesh(arrays, str(path)), parts=parts)

@@ -33,7 +33,7 @@ from wbgs_jax.evaluation.baselines import baselines, can_lend, nearest_links
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.intervals import Confidence, Expected, ExpectedPower, PowerConfidence, expect_many, expected_power
-from wbgs_jax.inference.kriging import for_receiver, without_asked
+from wbgs_jax.inference.kriging import for_receiver, without_queried
 from wbgs_jax.inference.predictor import BLOCK, as_observed, observe, observe_links, render_pas
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.radio import channel
@@ -149,8 +149,8 @@ def power_figures(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: I
     if report is None:
         return None
     others = {"free_space": free_space(dataset, index)}
-    heard = _with_received_training(dataset)
-    if can_lend(heard, index[_received(dataset, index)]):
+    lending = _with_received_training(dataset)
+    if can_lend(lending, index[_received(dataset, index)]):
         others["nearest_tx"] = nearest_power(dataset, index)
     return report | {"baselines": {name: score_received(values, dataset, index) for name, values in others.items()}}
 
@@ -197,10 +197,10 @@ def free_space(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarr
 def nearest_power(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Returns the power (dB) of the nearest training transmitter that was received at the same frequency and receiver; silence
     at receivers that received none."""
-    heard = _with_received_training(dataset)
-    known = np.isin(dataset.receiver_index[index], dataset.receiver_index[heard.train])
+    lending = _with_received_training(dataset)
+    known = np.isin(dataset.receiver_index[index], dataset.receiver_index[lending.train])
     powers = np.full(len(index), NO_PATH_DB, np.float32)
-    found = dataset.received_db(nearest_links(dataset, index[known], heard.train))
+    found = dataset.received_db(nearest_links(dataset, index[known], lending.train))
     assert found is not None
     powers[known] = found
     return powers
@@ -249,7 +249,7 @@ def evaluate(
     index = held_out(dataset, part)
     tested = part == "test"
     if not tested and trained.correction is not None:  # residual kriging uses the validation part
-        left = without_asked(trained.correction, dataset.query(index))
+        left = without_queried(trained.correction, dataset.query(index))
         trained = dataclasses.replace(trained, correction=left)
     reference = with_validation_trained(dataset) if tested else dataset
     with ThreadPoolExecutor(1) as threads, CountProgress("predicted spectra", len(index), shown=shown) as progress:
@@ -420,10 +420,10 @@ def timed_calls(trained: TrainedField, dataset: Dataset) -> dict[str, Callable[[
     """Returns the calls that `time_queries` measures, by the names of its figures. The first one of each compiles."""
     plan = trained.field.plan(trained.params, dataset.receiver())
     neighbours = for_receiver(trained.correction, dataset.receiver())
-    asked = dataset.test if len(dataset.test) else dataset.train
+    timed = dataset.test if len(dataset.test) else dataset.train
 
     def call(size: int) -> None:
-        query = dataset.query(np.resize(asked, size))
+        query = dataset.query(np.resize(timed, size))
         jax.block_until_ready(render_pas(trained.field, trained.params, plan, query, neighbours))
 
     return {name: partial(call, size) for name, size in TIMED.items()}

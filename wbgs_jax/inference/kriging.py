@@ -113,7 +113,7 @@ Beside = Neighbours | Mixture | None
 """Use of measured spectra together with a field: kriging with many measurements, a mixture with few; None: not used."""
 
 
-def without_asked(neighbours: Beside, query: Query) -> Beside:
+def without_queried(neighbours: Beside, query: Query) -> Beside:
     """Returns the measurements without those of the queried links (host); None if none remain."""
     if neighbours is None:
         return None

@@ -16,7 +16,7 @@ import numpy as np
 
 from wbgs_jax._util.cli import link_words
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write, opened_archive, read_json, told, write_csv, write_json
+from wbgs_jax._util.files import atomic_write, opened_archive, read_json, reported, write_csv, write_json
 from wbgs_jax.inference.quantities import QUANTITIES
 from wbgs_jax.inference.queries import COLUMNS, Queries, shown_rows
 
@@ -121,19 +121,19 @@ def open_parts(target: Path, question: dict[str, Any], resume: bool) -> PartFile
         UserError: there are blocks without `resume`, or the blocks belong to other queries.
     """
     folder = part_folder(target)
-    asked, done = folder / "question.json", 0
+    recorded, done = folder / "question.json", 0
     while _file(folder, done).exists():
         done += 1
     if done and not resume:
         raise UserError(
             f"{folder} contains results of an interrupted command; add --resume to continue it, or remove the folder"
         )
-    if done and (changed := _difference(read_json(asked), question)):
+    if done and (changed := _difference(read_json(recorded), question)):
         raise UserError(
             f"{folder} contains results of another command ({changed} changed); remove the folder, or choose another --out"
         )
     if not done:
-        write_json(asked, question)
+        write_json(recorded, question)
     return PartFiles(folder, done)
 
 
@@ -173,7 +173,7 @@ def write_arrays(path: Path, arrays: dict[str, Any], source: dict[str, Any]) -> 
 
 
 def _joined(pieces: list[np.ndarray]) -> np.ndarray:
-    with told("a stored block of results", "remove the folder of blocks, and run the command again"):
+    with reported("a stored block of results", "remove the folder of blocks, and run the command again"):
         return np.concatenate(pieces)
 
 

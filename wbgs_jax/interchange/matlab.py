@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wbgs_jax._util.files import MOST_BYTES, check_file, read_arrays, told
+from wbgs_jax._util.files import MOST_BYTES, check_file, read_arrays, reported
 
 HEADER, MATRIX, COMPRESSED = 128, 14, 15
 STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
@@ -45,7 +45,7 @@ def read_mat(path: Path) -> dict[str, np.ndarray]:
         UserError: the file is missing, damaged, or of another version.
     """
     advice = "give a .mat file of version 5 (MATLAB: save -v7), or an .npz file"
-    with told(str(path), advice):
+    with reported(str(path), advice):
         check_file(path, str(path), advice)
         whole = memoryview(path.read_bytes())
         order = {b"IM": "<", b"MI": ">"}.get(bytes(whole[126:HEADER]))

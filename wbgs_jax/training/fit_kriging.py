@@ -106,7 +106,7 @@ class _Known:
 
     def __init__(self, field: Field, params: Params, dataset: Dataset, index: Int[np.ndarray, " m"]):
         self._made: dict[Kind, Num[Array, "m 90 360"]] = {}
-        self._asked, self.dataset, self.index = (field, params), dataset, index
+        self._trained, self.dataset, self.index = (field, params), dataset, index
 
     def neighbours(self, choice: Choice) -> Neighbours:
         """Returns the residual kriging from these links with the settings of a choice."""
@@ -116,7 +116,7 @@ class _Known:
         return make_neighbours(choice, self.dataset, self.index, self._made[choice.kind])
 
     def _predicted(self) -> Float[np.ndarray, "m 90 360"]:
-        return as_observed(*self._asked, predict_spectra(*self._asked, self.dataset, self.index))
+        return as_observed(*self._trained, predict_spectra(*self._trained, self.dataset, self.index))
 
 
 def images_of(

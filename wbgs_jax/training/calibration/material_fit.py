@@ -264,9 +264,9 @@ def _sized(
     return params, likely
 
 
-def frequencies_to_look_at(frequency_hz: Float[np.ndarray, " n"], believed_hz: float) -> list[float]:
+def frequencies_to_look_at(frequency_hz: Float[np.ndarray, " n"], accurate_hz: float) -> list[float]:
     """Returns the maximum frequencies of the successive comparisons, ascending: those of the data with ratios of at least
-    `APART`, up to `believed_hz`, beyond which phases are inaccurate. The lowest frequency alone contains little information; it
+    `APART`, up to `accurate_hz`, beyond which phases are inaccurate. The lowest frequency alone contains little information; it
     is left out unless the first comparison at the next one would not include thick walls."""
     found = [float(frequency_hz.max())]
     for one in np.unique(frequency_hz)[::-1]:
@@ -274,7 +274,7 @@ def frequencies_to_look_at(frequency_hz: Float[np.ndarray, " n"], believed_hz: f
     first, *others = found[::-1]
     if others and len(_steps("concrete", others[0])) <= MOST:
         first, *others = others
-    return [first, *(one for one in others if one <= believed_hz)]
+    return [first, *(one for one in others if one <= accurate_hz)]
 
 
 def _all_slabs(frequency_hz: float) -> list[Slab]:

@@ -193,8 +193,8 @@ def search_clutter(
     """
     tx = problem.tx_index()
     everyone = rng.permutation(np.unique(tx))
-    judges = 0.25  # fraction of the transmitters on whose spectra the absorption grid is tested
-    testers = everyone[: round(judges * len(everyone))]
+    tested = 0.25  # fraction of the transmitters on whose spectra the absorption grid is tested
+    testers = everyone[: round(tested * len(everyone))]
     if len(testers) < FEWEST:
         return params, problem, None
     of_testers = np.isin(tx, testers)
