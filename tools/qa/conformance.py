@@ -1,4 +1,4 @@
-"""What becomes of files that other programs write: `make conformance`, or `python -m tools.qa.conformance [--only Blender]`.
+"""Treatment of files that other programs write: `make conformance`, or `python -m tools.qa.conformance [--only Blender]`.
 
 Runs the conformance suite (tests/conformance), in which the programs make their files and this library reads them, and writes
 experiments/results/conformance.json: a row for each file, and counts by kind; docs/formats.md quotes it. A file that is neither
@@ -44,7 +44,7 @@ class Command:
     """Make the files of all writers that are installed, and read them."""
 
     only: str = ""
-    """Those of a part alone, as `pytest -k` has it; nothing is written then."""
+    """Tests of one part alone, as in `pytest -k`; nothing is written then."""
     out: Path = FOLDER
 
 

@@ -21,7 +21,7 @@ class Command:
     """Write which share of the library's lines and branches tests reach."""
 
     report: Path = Path("coverage.json")
-    """Of pytest-cov (`--cov-report=json`)."""
+    """Report of pytest-cov (`--cov-report=json`)."""
     out: Path = FOLDER
 
 

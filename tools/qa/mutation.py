@@ -48,9 +48,9 @@ class Command:
     only: tuple[str, ...] = ()
     """Modules (slab, array, ...); all by default."""
     number: int = 20
-    """Of mutants of a module."""
+    """Number of mutants of a module."""
     seed: int | None = None
-    """Of those that are drawn; a new one by default."""
+    """Seed of the mutants that are drawn; a new one by default."""
     out: Path = FOLDER
 
 
@@ -98,7 +98,7 @@ def tried(tree: Path, module: str, number: int, seed: int) -> Iterator[tuple[Any
     path = tree / "wbgs_jax" / f"{module}.py"
     begin = time.perf_counter()
     if not passes(tree, MODULES[module], seed):
-        raise UserError(f"the tests of {module} fail as the code stands; mend them first")
+        raise UserError(f"the tests of {module} fail as the code stands; fix them first")
     limit = PATIENCE * (time.perf_counter() - begin)
     specs = mutants(path)
     for spec in random.Random(seed).sample(specs, min(number, len(specs))):

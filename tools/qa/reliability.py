@@ -1,4 +1,4 @@
-"""What the product was made to bear: `python -m tools.qa.reliability [--only kills]`.
+"""Faults that the product withstands: `python -m tools.qa.reliability [--only kills]`.
 
 Runs the tests of faults (tests/reliability, the slow ones too) and counts what was tried and held: kills, disks that refuse
 writes, damaged files, careless command lines. Writes experiments/results/reliability.json; docs/reliability.md quotes it. What
@@ -34,10 +34,10 @@ class Command:
     """Run the tests of faults and write what they tried."""
 
     only: str = ""
-    """Those of a part alone, as `pytest -k` has it: kills, full_disks, fuzz_readers, fuzz_commands, guided; other
+    """Tests of one part alone, as in `pytest -k`: kills, full_disks, fuzz_readers, fuzz_commands, guided; other
     counts stay."""
     seed: int | None = None
-    """Of everything that is drawn; a new one by default."""
+    """Seed of everything that is drawn; a new one by default."""
     out: Path = FOLDER
 
 
