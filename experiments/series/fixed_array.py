@@ -10,7 +10,7 @@ from wbgs_jax.data.scene_file import load_scene
 
 SERIES = (
     Series("wideband (ours)", "wideband", ("",), "quick", (FIXED_SCENE,), seeds=SEEDS),
-    Series("wideband, not told the frequency", "wideband", ("pooled",), "quick", (FIXED_SCENE,), seeds=SEEDS),
+    Series("wideband, without the frequency", "wideband", ("pooled",), "quick", (FIXED_SCENE,), seeds=SEEDS),
     Series("WRF-GS, a model a frequency", "wrfgs", ("",), "quick", (FIXED_SCENE,), seeds=SEEDS),
     Series("coherent (ours)", "wave", ("",), "quick", (FIXED_SCENE,)),
 )

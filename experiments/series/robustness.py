@@ -23,10 +23,10 @@ LEARN_NOTHING = {"nearest_tx": "nearest TX", "inverse_distance": "1/d² weightin
 NOTE = (
     "Scene {scene}: averages over ten frequencies of the median SSIM, profile `{profile}`, of one seed (which also draws the"
     " faults), or the median and range of several. *Hybrid*: one training with default settings. *Coherent, no corrections*:"
-    " the coherent field alone, without the searches for absent bodies, displaced surfaces, the receiver's pose, clutter and"
-    " array gains. *Ahead by*: hybrid minus the best of wideband, nearest TX and 1/d². These three do not use the mesh's"
-    " details: where only the mesh is wrong, they are those of the fault-free data (cells left empty), and for *all together*"
-    " those at 20 dB SNR. Only seeds that all of them share count there. *Missing* and *added* are shares of"
+    " the coherent field alone, without the searches for absent bodies, displaced surfaces, the receiver's pose, absorption"
+    " grid and array gains. *Ahead by*: hybrid minus the best of wideband, nearest TX and 1/d². These three do not use the"
+    " mesh's details: where only the mesh is wrong, they are those of the fault-free data (cells left empty), and for *all"
+    " together* those at 20 dB SNR. Only seeds that all of them share count there. *Missing* and *added* are shares of"
     " the mesh's connected pieces below 3 m: boards, legs, doors and panes, of which an object has several."
 )
 WORST = (
@@ -53,7 +53,7 @@ def render(results: Results) -> str:
 
 BySeed = dict[int, float]
 Scores = list[BySeed]
-"""Of the hybrid field, of the splatting field and of what learns nothing: those of the seeds that were run."""
+"""Scores of the hybrid field, of the splatting field and of the predictors without learning, of the seeds that were run."""
 
 
 def scores(results: Results, scene: str, variant: str) -> Scores:
