@@ -92,7 +92,7 @@ def fill_piece(text: str, piece: str, numbers: list[str]) -> str:
     row = ("^" * piece.startswith("|"), "$" * piece.endswith("|"))
     found = list(re.finditer(NUMBER.join(literal).join(row), text, re.MULTILINE))
     if len(found) != 1:
-        raise UserError(f"docs/evidence: {piece!r} stands {len(found)} times in its page; mend one of the two")
+        raise UserError(f"docs/evidence: {piece!r} stands {len(found)} times in its page; correct one of the two")
     match = found[0]
     for group in reversed(range(len(numbers))):
         start, end = match.span(group + 1)
@@ -112,13 +112,13 @@ def look_up(folder: Path, file: str, place: str) -> float:
     if (folder / file).exists():
         found: Any = read_json(folder / file)
     elif (found := read_row(rows, row)) is None:
-        raise UserError(f"a page quotes {file}, which is not in {folder}; run what writes it, or mend the page")
+        raise UserError(f"a page quotes {file}, which is not in {folder}; run the command that writes it, or correct the page")
     for name in place.split("."):
         if not isinstance(found, dict) or name not in found:
-            raise UserError(f"a page quotes {place} of {file}, which has no {name!r}; mend the page")
+            raise UserError(f"a page quotes {place} of {file}, which has no {name!r}; correct the page")
         found = found[name]
     if not isinstance(found, int | float):
-        raise UserError(f"a page quotes {place} of {file}, which is no number; mend the page")
+        raise UserError(f"a page quotes {place} of {file}, where there is no number; correct the page")
     return found
 
 

@@ -37,7 +37,7 @@ BLOCK = 256
 
 @dataclass(frozen=True)
 class Part:
-    """What one trained model of a job leaves."""
+    """Results of one trained model of a job."""
 
     tx: Int[np.ndarray, " tx"]
     ghz: Float[np.ndarray, " ghz"]
@@ -48,7 +48,7 @@ class Part:
     sizes: Int[np.ndarray, "2"]
     """Steps, and Gaussians at the end."""
     seconds: Float[np.ndarray, "2"]
-    """Of training and of evaluation."""
+    """Durations of training and of evaluation."""
     pictures: UInt8[np.ndarray, "k 90 360"]
 
 
@@ -97,13 +97,13 @@ def score(dataset: Dataset, predicted: Float[np.ndarray, "n 90 360"]) -> dict[st
     """Returns SSIM and PSNR of the test spectra, by transmitter (and receiver) and frequency.
 
     Raises:
-        UserError: a transmitter was not heard at every frequency, or twice at one.
+        UserError: a transmitter has no test spectrum at a frequency, or two at one.
     """
     test = dataset.test
-    asked_ghz = dataset.frequencies_hz[test] / 1e9
-    ghz = np.unique(asked_ghz)
-    order = np.lexsort((asked_ghz, dataset.receiver_index[test], dataset.tx_index[test]))
-    if len(test) % len(ghz) or not np.array_equal(asked_ghz[order], np.resize(ghz, len(test))):
+    test_ghz = dataset.frequencies_hz[test] / 1e9
+    ghz = np.unique(test_ghz)
+    order = np.lexsort((test_ghz, dataset.receiver_index[test], dataset.tx_index[test]))
+    if len(test) % len(ghz) or not np.array_equal(test_ghz[order], np.resize(ghz, len(test))):
         raise UserError(
             f"{dataset.name}: not every test transmitter has one spectrum at every frequency, which tables by frequency need; "
             "leave the others out of test_index.txt"

@@ -1,6 +1,6 @@
-"""What can be wrong with data and scene descriptions that people bring, one fault at a time: a data set with the fault in it.
+"""Faults of users' data and scene descriptions, one at a time: a data set with the fault in it.
 
-The truth of the test stays as it is, but for what is the receiver's own: an array out of tune hears everything so.
+The truth of the test stays as it is, except for errors of the receiver: phase errors of the array are in all its snapshots.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ PAS_AT_ONCE = 512
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong. Lengths and angles are standard deviations along each axis, unless they say otherwise."""
+    """Sizes of faults. Lengths and angles are standard deviations along each axis, unless stated otherwise."""
 
     displaced_m: float = 0
     """Every part of the mesh stands elsewhere ..."""
@@ -47,7 +47,7 @@ class Fault:
     pattern_unknown: bool = False
     """The elements are said to be isotropic."""
     snr_db: float | None = None
-    """Of the training snapshots."""
+    """Signal-to-noise ratio of the training snapshots."""
     tx: int | None = None
     """Training transmitters."""
     images_only: bool = False
@@ -146,16 +146,16 @@ def with_wrong_receiver(dataset: Dataset, fault: Fault, rng: np.random.Generator
 
 
 def with_wrong_snapshots(dataset: Dataset, fault: Fault, rng: np.random.Generator) -> Dataset:
-    """Returns it with noise on the training snapshots, and with elements out of tune on all."""
+    """Returns it with noise on the training snapshots, and with phase errors of the elements on all."""
     if not dataset.has("snapshots"):
         return dataset
-    heard = dataset.observations["snapshots"]
+    snapshots = dataset.observations["snapshots"]
     if fault.array_deg:
-        heard = heard * np.exp(1j * np.deg2rad(rng.normal(0, fault.array_deg, heard.shape[-1])))
+        snapshots = snapshots * np.exp(1j * np.deg2rad(rng.normal(0, fault.array_deg, snapshots.shape[-1])))
     if fault.snr_db is not None:
-        heard = heard.copy()
-        heard[dataset.train] += _noise(heard[dataset.train], fault.snr_db, rng)
-    return dataset.with_observations(snapshots=heard.astype(np.complex64))
+        snapshots = snapshots.copy()
+        snapshots[dataset.train] += _noise(snapshots[dataset.train], fault.snr_db, rng)
+    return dataset.with_observations(snapshots=snapshots.astype(np.complex64))
 
 
 def as_images(dataset: Dataset) -> Dataset:
@@ -204,11 +204,11 @@ def _with_triangles(dataset: Dataset, faces: Int[np.ndarray, "k 3"], like: Int[n
 
 
 def _noise(
-    heard: Complex[np.ndarray, "n elements"], snr_db: float, rng: np.random.Generator
+    snapshots: Complex[np.ndarray, "n elements"], snr_db: float, rng: np.random.Generator
 ) -> Complex[np.ndarray, "n elements"]:
     """Returns complex normal noise, so many decibels below the mean power of every snapshot."""
-    power = np.mean(np.abs(heard) ** 2, -1, keepdims=True) * 10 ** (-snr_db / 10)
-    return np.sqrt(power / 2) * (rng.normal(size=heard.shape) + 1j * rng.normal(size=heard.shape))
+    power = np.mean(np.abs(snapshots) ** 2, -1, keepdims=True) * 10 ** (-snr_db / 10)
+    return np.sqrt(power / 2) * (rng.normal(size=snapshots.shape) + 1j * rng.normal(size=snapshots.shape))
 
 
 def _directions(rng: np.random.Generator, n: int) -> Float[np.ndarray, "n 3"]:

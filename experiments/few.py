@@ -1,5 +1,5 @@
-"""What one command makes of few spectra, beside every simple method: `python -m experiments.few`, experiments/results/few.jsonl
-and few.json.
+"""Scores of one command on few spectra, beside every simple method: `python -m experiments.few`,
+experiments/results/few.jsonl and few.json.
 
 A case is a data set with some of its training transmitters, drawn at random or along a track; a row is a case and a seed,
 trained with the defaults and scored on the test transmitters of the data. Rows that are there are not made again. `--part 0/2`
@@ -58,7 +58,7 @@ class Case:
     name: str
     source: str
     transmitters: int
-    """Of the training part, validation included."""
+    """Number of training transmitters, validation included."""
     draw: Draw
     seeds: int
     frequency_ghz: float | None = None
@@ -204,8 +204,8 @@ def stored(case: Case, seed: int, runs: Path) -> dict[str, Any]:
     index = dataset.test
     everything = np.ones((len(index), len(known.links)), bool)
     pas = predict_spectra(result.field, result.params, dataset, index)
-    asked = HeldOut(index, pas, everything, index)
-    tested, test_u = share_scores(mixture, dataset, asked, *simple_answers(mixture, dataset, known, asked))
+    of_test = HeldOut(index, pas, everything, index)
+    tested, test_u = share_scores(mixture, dataset, of_test, *simple_answers(mixture, dataset, known, of_test))
     shutil.rmtree(runs / "stored")
     values = {"scores": scores, "u": u, "test_median": np.median(tested, 0), "test_u": test_u}
     return {

@@ -1,4 +1,4 @@
-"""What is trained: a `Job` is one row of an experiment: data, field, frequencies, transmitters, change, size, seed.
+"""Trainings: a `Job` is one row of an experiment: data, field, frequencies, transmitters, change, size, seed.
 
 A job knows its data set; `settings.py` gives it its settings. Its name is that of its result, a line
 of experiments/results/<profile>.jsonl.
@@ -30,7 +30,7 @@ OUTSIDE_SCENES = tuple(OUTSIDE)
 RELEASED_GHZ = dict.fromkeys(SCENES, GHZ_10) | {DENSE_SCENE: GHZ_21, FIXED_SCENE: GHZ_FIXED} | OUTSIDE
 """Released scenes and their frequencies."""
 SEEDS = (0, 1, 2)
-"""Of the headline rows."""
+"""Seeds of the headline rows."""
 ONE_FREQUENCY = ("wrfgs",)
 """Fields that know one frequency: a model for each, all of them one job."""
 BASELINES = "baselines"
@@ -45,13 +45,13 @@ ROOMS = {
 }
 """A room of each flat that the receiver does not stand in: lowest and highest corner, metres."""
 PICTURED_SCENES = ("1", "4")
-"""What is kept in pictures (figure 4)."""
+"""Scenes of which pictures are kept (figure 4)."""
 PICTURED_GHZ = (1, 10, 24.25, 37, 47, 60, 77, 94)
 
 
 @dataclass(frozen=True)
 class Job:
-    """One training and its evaluation (of a model for every frequency, if the field knows one alone)."""
+    """One training and its evaluation (of a model for every frequency, if the field supports only one)."""
 
     scene: str
     """Released scene (1, 2, ..., 1_21f, 2_fixed, cabin), or a scene file or folder of spectra by its path."""
@@ -63,9 +63,9 @@ class Job:
     """Train with all transmitters, as the paper's tables 2 and 6: only the frequency is new to the field."""
     seed: int = 0
     variant: str = ""
-    """What is changed, one of `variants.VARIANTS`."""
+    """Variant of the settings, one of `variants.VARIANTS`."""
     profile: str = "quick"
-    """How large, one of `profiles.PROFILES`."""
+    """Size, one of `profiles.PROFILES`."""
 
     @property
     def name(self) -> str:
@@ -81,7 +81,7 @@ class Job:
 
     @property
     def budget(self) -> float:
-        """How many times the usual number of spectra it sees."""
+        """Number of spectra it sees, as a multiple of the usual number."""
         return VARIANTS[self.variant].budget
 
     @property
@@ -98,7 +98,7 @@ class Job:
 
     @property
     def test_ghz(self) -> tuple[float, ...]:
-        """Frequencies asked for."""
+        """Test frequencies."""
         return tuple(f for f in self.known_ghz if f not in self.train_ghz) if self.combination else self.known_ghz
 
     @property

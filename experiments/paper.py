@@ -1,6 +1,6 @@
-"""What the paper (arXiv 2505.20714) reports: its tables, the figures' numbers that its text quotes, and its combinations.
+"""Results of the paper (arXiv 2505.20714): its tables, the figures' numbers that its text quotes, and its combinations.
 
-All values are median SSIM. Figures 4, 6, 7 and 8 are pictures; only what the text says about them is here.
+All values are median SSIM. Figures 4, 6, 7 and 8 are pictures; only the numbers in the text are here.
 """
 
 SCENES = ("1", "2", "3", "4", "5", "6")

@@ -1,4 +1,4 @@
-"""How large everything is: a `Profile` gives a job its preset, its steps and what else is smaller than in the preset."""
+"""Sizes of jobs: a `Profile` gives a job its preset, its steps and what else is smaller than in the preset."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,10 +14,10 @@ class Profile:
 
     preset: str
     steps: int
-    """Of a field for all frequencies. Models of one frequency share as many between them."""
+    """Steps of a field for all frequencies. Models of one frequency share as many between them."""
     wave_steps: int
     changes: Changes = field(default_factory=dict)
-    """What differs from the preset, whatever the field ..."""
+    """Differences from the preset, for every field ..."""
     fields: Changes = field(default_factory=dict)
     """... and by field, of its own settings."""
     scored_tx: int | None = None
@@ -43,16 +43,16 @@ BY_ADAM: dict[str, Any] = {
     "features_lr": 0.0,
     "radiance_widths": (64, 32),
 }
-"""What the splatting fields had until Muon came: the series of that time, which chose other settings, keep it."""
+"""Settings of the splatting fields before Muon: the series of that time, which chose other settings, keep them."""
 STEPS_BY_ADAM = 6000
-"""Of the `cpu` preset until then."""
+"""Steps of the `cpu` preset before Muon."""
 NERF2_BY_ADAM = {"network_optimizer": "adam", "network_lr": 4e-3}
-"""What the NeRF2-style field had until then."""
+"""Settings of the NeRF2-style field before Muon."""
 QUICK_BY_ADAM = QUICK | {
     "fields": {"wideband": GAUSSIANS | BY_ADAM, "wrfgs": GAUSSIANS | BY_ADAM, "nerf2": NERF2_BY_ADAM},
 }
 BEFORE = BY_ADAM | {"network_lr": 1e-3, "fusion": 0}
-"""What the `cpu` preset had when its inputs and sizes were chosen."""
+"""Settings of the `cpu` preset when its inputs and sizes were chosen."""
 PROFILES = {
     # Of the tables, whose jobs can have any of these.
     "quick": Profile("cpu", 1000, 600, **QUICK),
@@ -70,7 +70,7 @@ PROFILES = {
     "main": Profile("cpu", 2400, 600, validation=True),
     "rates": Profile("cpu", 1000, 600, **QUICK, validation=True, scored_tx=SCORED_FEW),
     "rooms": Profile("cpu", 1000, 600, **QUICK),
-    # What a user gets who asks for nothing.
+    # The default settings.
     "robustness": Profile("cpu", 2400, 2000),
     "schedules": Profile("cpu", 2000, 600, fields={"wideband": BY_ADAM}, validation=True),
     "frequency": Profile("cpu", 1000, 600, fields={"wideband": BY_ADAM}, validation=True),

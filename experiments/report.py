@@ -17,7 +17,7 @@ def pair(result: dict[str, Any]) -> str:
 def quality_table(results: list[dict[str, Any]]) -> str:
     """Returns a table with one row a quality file, the baselines beside the field."""
     names = list(results[0]["baselines"])
-    head = ["dataset", "field", *(name.replace("_", " ") for name in names), "preset, device", "training", "ms a PAS"]
+    head = ["dataset", "field", *(name.replace("_", " ") for name in names), "preset, device", "training", "ms per PAS"]
     rows = []
     for r in results:
         origin = r["provenance"]

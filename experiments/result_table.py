@@ -26,7 +26,7 @@ OF_JOB = ("profile", "job", "scene", "field", "variant", "combination", "all_tx"
 OF_FREQUENCY = ("ghz", "n", "median_ssim", "mean_ssim", "psnr_db")
 """`n`: spectra, of as many transmitters. `psnr_db`: the median."""
 OF_RUN = ("models", "steps", "samples", "gaussians", "training_seconds", "version", "commit", "device", "jax")
-"""Of the whole job."""
+"""Columns of the whole job."""
 COLUMNS = OF_JOB + OF_FREQUENCY + OF_RUN
 DIGITS = 4
 NO_JOBS = {"smoke", "few"}

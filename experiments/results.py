@@ -30,22 +30,22 @@ FOLDER = Path(__file__).parent / "results"
 SHARED = Path("..") / "shared" / "data"
 """Where published samples lie, beside the repository."""
 EDITION = 3
-"""Of the presets that a row's settings are differences from. Who changes a preset raises it, and gives the settings of the rows
-that still count anew."""
+"""Edition of the presets that a row's settings are differences from. Who changes a preset raises it, and gives the settings of
+the rows that still count anew."""
 NAME = re.compile(r'\{"name": "([^"\\]+)"')
-"""How every line of a file of rows begins."""
+"""Beginning of every line of a file of rows."""
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Result:
-    """What is known of a job that was run."""
+    """Record of a job that was run."""
 
     values: dict[str, Any]
 
     @cached_property
     def ghz(self) -> list[float]:
-        """Frequencies that were asked for, ascending."""
+        """Test frequencies, ascending."""
         return [float(f) for f in self.values["ssim"]]
 
     @cached_property
@@ -55,12 +55,12 @@ class Result:
 
     @cached_property
     def ssim(self) -> Float[np.ndarray, "tx ghz"]:
-        """Of every scored spectrum."""
+        """SSIM of every scored spectrum."""
         return np.array(list(self.values["ssim"].values())).T
 
     @property
     def seconds(self) -> float:
-        """Of training and evaluation, as far as they are known."""
+        """Duration of training and evaluation, as far as it is known."""
         return self.values.get("training_seconds", 0) + self.values.get("evaluation_seconds", 0)
 
     def at(self, ghz: list[float], tx: list[int]) -> Float[np.ndarray, "tx ghz"]:
@@ -152,7 +152,7 @@ def add_rows(path: Path, rows: Mapping[str, Row]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = {name: json.dumps({"name": name} | row, allow_nan=False) for name, row in rows.items()}
     with path.with_suffix(".lock").open("a") as lock:
-        with contextlib.suppress(OSError):  # some clusters' file systems know no locks
+        with contextlib.suppress(OSError):  # some clusters' file systems have no locks
             fcntl.flock(lock, fcntl.LOCK_EX)
         whole = read_lines(path) | lines
         with atomic_write(path) as stream:

@@ -2,8 +2,8 @@
 
 Without `--only` these are the tables and figures of the paper; the series (`--only choices`, `tuning`, `wave_choices`) are run
 by name. Jobs come in the order of importance: every experiment's first seed, then further ones, of those that see more spectra
-after the others. What is done is skipped, what was cut goes on where it stopped, however it was cut. `--cluster local` does
-several jobs at once, `--cluster tcp://...` on the workers of any Dask scheduler (docs/cluster.md). `make tables` shows the
+after the others. Finished jobs are skipped, interrupted ones resume where they stopped, however they ended. `--cluster local`
+does several jobs at once, `--cluster tcp://...` on the workers of any Dask scheduler (docs/cluster.md). `make tables` shows the
 results.
 """
 
@@ -60,7 +60,7 @@ class Command:
     fields: tuple[str, ...] = ()
     """Fields (wideband, wrfgs, wave, baselines, ...); all by default."""
     variants: tuple[str, ...] = ()
-    """What is changed (snr_10, tx_20, missing_30, ...; experiments/variants.py); all by default."""
+    """Variants (snr_10, tx_20, missing_30, ...; experiments/variants.py); all by default."""
     minutes: float | None = None
     """Stop after this time; what is cut goes on the next time."""
     dry_run: bool = False
@@ -120,7 +120,7 @@ def all_jobs(names: tuple[str, ...] = (), profile: str = "quick") -> list[Job]:
 
 
 def chosen_jobs(command: Command) -> list[Job]:
-    """Returns what a command line asks for."""
+    """Returns the jobs of a command line."""
     jobs = all_jobs(command.only, command.profile)
     choices = {"scene": command.scenes, "seed": command.seeds, "field": command.fields, "variant": command.variants}
     for name, wanted in choices.items():
@@ -133,7 +133,7 @@ def chosen_jobs(command: Command) -> list[Job]:
 
 
 class Durations:
-    """How long jobs take, learned from those that are done."""
+    """Durations of jobs, learned from those that are done."""
 
     def __init__(self, results: Results, jobs: list[Job]):
         self.known: dict[tuple, list[float]] = {}
@@ -227,7 +227,7 @@ def run_here(jobs: list[Job], open_jobs: list[Job], command: Command) -> list[st
 
 
 def run_on_cluster(jobs: list[Job], open_jobs: list[Job], command: Command) -> list[str]:
-    """Let the workers of a Dask cluster run jobs. What a killed worker has begun goes on where it stopped, on another one."""
+    """Lets the workers of a Dask cluster run jobs. Another worker resumes the job of a killed one where it stopped."""
     results, failures, left = Results(command.profile, command.results), list[str](), list(open_jobs)
     everywhere = dataclasses.replace(command, results=command.results.resolve(), runs=command.runs.resolve())
     seconds = None if command.minutes is None else 60 * command.minutes

@@ -13,7 +13,7 @@ from wbgs_jax.fields import get_field
 HOUSEKEEPING = ("loop.evaluate_every", "loop.evaluate_spectra", "loop.checkpoint_every", "loop.keep_checkpoints")
 """Settings that change no result."""
 FAULT_NAMES = {"displaced_m": "mesh.displacement"}
-"""Of faults in result files that older ones had."""
+"""Names of faults in older result files."""
 
 
 def settings(job: Job) -> Settings:

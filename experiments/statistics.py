@@ -1,4 +1,4 @@
-"""What can be said of scores of a few hundred transmitters and a few seeds: intervals, seeds, paired tests.
+"""Statistics of scores of a few hundred transmitters and a few seeds: intervals, seeds, paired tests.
 
 Spectra of one transmitter at several frequencies are no independent samples, so the transmitter is what is drawn again and
 what is paired. All scores of a row come as (seeds, transmitters, frequencies).
@@ -13,7 +13,7 @@ from scipy.stats import wilcoxon
 DRAWS, AT_ONCE = 1000, 50
 LEVEL = 0.95
 SEED = 0
-"""Of the bootstrap."""
+"""Seed of the bootstrap."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Comparison:
     difference: float
     """Median over transmitters of the difference of their mean SSIM."""
     share: float
-    """Of the transmitters at which the first is better."""
+    """Share of the transmitters at which the first is better."""
     p: float
     """Wilcoxon's signed-rank test, two-sided."""
     transmitters: int

@@ -10,12 +10,12 @@ from experiments.profiles import Changes
 
 @dataclass(frozen=True)
 class Variant:
-    """What differs from the profile's settings."""
+    """Differences from the profile's settings."""
 
     changes: Changes = field(default_factory=dict)
     """Section of the settings, "field" for the field's own: what differs."""
     budget: float = 1
-    """How many times the usual number of spectra is seen."""
+    """Number of spectra seen, as a multiple of the usual number."""
     steps: int | None = None
     """Steps, instead of the profile's."""
     rates: float = 1
@@ -23,7 +23,7 @@ class Variant:
     room: bool = False
     """Whether a whole room is the test (`jobs.ROOMS`), and nothing of it trains."""
     fault: Fault = Fault()  # noqa: RUF009 (frozen)
-    """What is wrong with the data."""
+    """Fault of the data."""
 
 
 def _of_field(**values: object) -> Variant:
@@ -37,7 +37,7 @@ def _batch(size: int, steps: int) -> Variant:
 
 
 PRECISIONS = ("precision_float32", "precision_tf32", "precision_bfloat16")
-"""Of what the networks multiply."""
+"""Precisions of the networks' matrix products."""
 RATES = ("1e-3", "2e-3", "3e-3", "8e-3", "1.6e-2", "3.2e-2")
 """Learning rates of the networks; the presets' is 4e-3."""
 HIGHER_RATE = 1.6e-2
@@ -89,14 +89,14 @@ FREQUENCY = {
     "f_heads_4": _warm(HIGHER_RATE, _BLIND | {"frequency_heads": 4}),
     "f_both": _warm(HIGHER_RATE, {"frequency_heads": 3, "frequency_degree": 3}),
 }
-"""What the frequency is to the networks."""
+"""Ways in which the frequency enters the networks."""
 SCHEDULES = {
     "warm_8e-3": _warm(8e-3),
     "warm_1.6e-2": _warm(1.6e-2),
     "warm_2.4e-2": _warm(2.4e-2),
     "steps_6000": Variant(steps=6000),
 }
-"""How fast, and how long."""
+"""Learning rates with warm-up, and numbers of steps."""
 OPTIMIZERS = {
     "adam_4e-3": _of_field(network_optimizer="adam", network_lr=4e-3),
     "adam_1.6e-2": _of_field(network_optimizer="adam", network_lr=1.6e-2),
@@ -122,7 +122,7 @@ _NO_MATERIALS = {"materials_lr": 0.0, "thickness_lr": 0.0}
 _UNTRAINED = _NO_MATERIALS | {"corrections_lr": 0.0}
 _NO_SEARCH: Changes = {"calibration": {"rounds": 0}}
 AS_IT_IS: Changes = {"calibration": {"geometry": False, "spurious_spectra": 0, "absorption_spectra": 0}}
-"""The mesh is believed: nothing in it is moved, left out or missed."""
+"""The mesh is exact: nothing in it is moved, left out or missed."""
 COHERENT = {
     "phase_blind": Variant({"field": {"coherent": False}, **_NO_SEARCH}),  # phases would name the materials
     "order_0": _of_field(mirror_areas=(), **_NO_EDGES),
@@ -170,7 +170,7 @@ FAULTS = {
         "all_together": Fault(displaced_m=0.01, missing=0.1, thickness_unknown=True, snr_db=20.0),
     }.items()
 }
-"""What can be wrong, one thing at a time, and the middle ones together."""
+"""Faults of the data, one at a time, and the medium ones together."""
 
 
 def uncorrected(fault: str) -> str:

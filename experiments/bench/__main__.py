@@ -30,7 +30,7 @@ from wbgs_jax.evaluation.report import device_name, environment
 
 RESULTS = Path(__file__).parents[1] / "results"
 OF_A_PART = ("commit", "version", "jax", "cores", "load", "torch", "repeats")
-"""What a part's figures depend on besides the device: others may have been measured another day."""
+"""Conditions of a part's figures besides the device: other parts may have been measured on another day."""
 Part = Literal["renderer", "training", "queries", "rays", "facets", "memory", "quality"]
 PARTS: dict[Part, Callable[[Report, Effort], None]] = {
     "renderer": renderer.measure,
@@ -68,7 +68,7 @@ class Command:
 
 
 def measure(command: Command) -> dict[str, Any]:
-    """{metrics, environment} of the parts that were asked for."""
+    """Returns {metrics, environment} of the requested parts."""
     effort = Effort(repeats=2 if command.quick else command.repeats, seed=command.seed, quick=command.quick)
     here = environment() | machine() | {"preset": training.preset(effort)} | dataclasses.asdict(effort)
     metrics: gate.Metrics = {}
@@ -83,7 +83,7 @@ def measure(command: Command) -> dict[str, Any]:
 
 
 def machine() -> dict[str, Any]:
-    """What else a time depends on."""
+    """Returns further conditions on which times depend."""
     torch = importlib.metadata.version("torch") if renderer.HAS_TORCH else None
     return {"cores": len(os.sched_getaffinity(0)), "load": round(os.getloadavg()[0], 2), "torch": torch}
 

@@ -34,7 +34,7 @@ def check(metrics: Metrics, baseline: Metrics) -> None:
             f" (tolerance {metrics[name]['tolerance']:.0%})"
             for name in failed
         ]
-        raise UserError(f"{len(failed)} of {len(ratios)} ratios regressed: {'; '.join(details)}; mend or accept with --update")
+        raise UserError(f"{len(failed)} of {len(ratios)} ratios regressed: {'; '.join(details)}; fix or accept with --update")
 
 
 def merge(result: dict[str, Any], baseline: dict[str, Any]) -> dict[str, Any]:

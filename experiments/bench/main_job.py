@@ -1,4 +1,4 @@
-"""What a step of `make train SCENE=1` costs, today and by the presets of before Muon: `python -m experiments.bench.main_job`.
+"""Cost of a step of `make train SCENE=1`, today and with the presets before Muon: `python -m experiments.bench.main_job`.
 
 Both are trained in turn, an epoch each, in one process on the same data; processor time, medians and spread (half of the
 interquartile range). Writes experiments/results/main_job.json; docs/performance.md quotes it.
@@ -33,7 +33,7 @@ class Command:
     scene: str = "1"
     """Released scene or scene file."""
     epochs: int = 6
-    """Of 50 steps each, after the first, which compiles."""
+    """Number of epochs of 50 steps, after the first, which compiles."""
     out: Path = FOLDER
 
 

@@ -54,7 +54,7 @@ class Curve:
         return next((t for t, s in zip(self.seconds, self.ssim, strict=True) if s >= target), None)
 
     def compilations_of(self, function: str) -> int:
-        """How often a jitted function was compiled."""
+        """Returns how often a jitted function was compiled."""
         return sum(name == f"jit({function})" for name, _ in self.compiled)
 
 

@@ -33,7 +33,7 @@ RIVAL_TX = 4
 RIVAL_CONFIG = WaveConfig(
     mirror_areas=(0.0, 0.0), specular_tried=1024, specular_kept=512, diffracted_tried=8, diffracted_kept=8
 )
-"""Two reflections off facets of any size, as the others are asked for; what passes through walls cannot be left out."""
+"""Two reflections off facets of any size, as in the other tracers; paths through walls cannot be excluded."""
 
 
 def measure(report: Report, effort: Effort) -> None:
@@ -58,8 +58,8 @@ def measure_scene(report: Report, effort: Effort, number: str) -> None:
     field = coherent.make_field(DatasetScene(dataset).mesh())
     params, receiver = tracers.known_params(field, dataset), dataset.receiver()
     plan = field.plan(params, receiver)
-    asked = dataset.query(first_links(dataset, BLOCK_TX))
-    some, tens = asked.tx_position, jnp.asarray(frequencies_of(dataset), jnp.float32)
+    query = dataset.query(first_links(dataset, BLOCK_TX))
+    some, tens = query.tx_position, jnp.asarray(frequencies_of(dataset), jnp.float32)
 
     def block() -> Any:
         paths = coherent.trace(plan, some)
@@ -69,7 +69,7 @@ def measure_scene(report: Report, effort: Effort, number: str) -> None:
         return answer(params, plan, coherent.trace(plan, some[:1]), jnp.zeros(len(tens), int), tens)
 
     def outside() -> Any:
-        return field.render(params, plan, jax.tree.map(lambda leaf: leaf[:1], asked))
+        return field.render(params, plan, jax.tree.map(lambda leaf: leaf[:1], query))
 
     ready, traced = (lambda: field.plan(params, receiver)), (lambda: coherent.trace(plan, some))
     calls = {"receiver": ready, "trace": traced, "block": block, "single": single, "outside": outside}
@@ -82,7 +82,7 @@ def measure_scene(report: Report, effort: Effort, number: str) -> None:
 
 
 def measure_facets(report: Report, effort: Effort) -> None:
-    """How processor time and memory grow with the number of facets, whatever else the machine does."""
+    """Measures how processor time and memory grow with the number of facets, whatever else the machine does."""
     for facets in FACETS[:1] if effort.quick else FACETS:
         _measure_hall(report, effort, facets)
 
@@ -131,26 +131,26 @@ def hall(facets: int, rng: np.random.Generator) -> Mesh:
 def _measure_rivals(report: Report, effort: Effort, number: str) -> None:
     """Other tracers at equal transmitters, receiver and orders, and how far they agree path by path."""
     dataset = load_dataset(number)
-    asked = np.asarray(dataset.query(first_links(dataset, RIVAL_TX)).tx_position, np.float64), frequencies_of(dataset)
+    queries = np.asarray(dataset.query(first_links(dataset, RIVAL_TX)).tx_position, np.float64), frequencies_of(dataset)
     ours = tracers.Ours(dataset, RIVAL_CONFIG)
     for name, (module, make) in tracers.RIVALS.items():
         if importlib.util.find_spec(module) is None:
             report.skip(f"rays_scene{number}_{name}", f"{module} is not installed; pip install {module}")
             continue
         say(f"rays: scene {number} beside {name}")
-        _measure_rival(report, effort, f"rays_scene{number}_{name}", ours, make(dataset, number), asked)
+        _measure_rival(report, effort, f"rays_scene{number}_{name}", ours, make(dataset, number), queries)
 
 
-def _measure_rival(report: Report, effort: Effort, label: str, ours: Any, rival: Any, asked: tuple[Any, Any]) -> None:
+def _measure_rival(report: Report, effort: Effort, label: str, ours: Any, rival: Any, queries: tuple[Any, Any]) -> None:
     """One of them: what a transmitter takes at all frequencies, both in turn, and what both find."""
-    sides = {"ours": functools.partial(ours.fields, *asked), "theirs": functools.partial(rival.fields, *asked)}
+    sides = {"ours": functools.partial(ours.fields, *queries), "theirs": functools.partial(rival.fields, *queries)}
     seconds = interleaved(sides, dataclasses.replace(effort, repeats=min(effort.repeats, 5)))
     report.add_sample(f"{label}_ratio", seconds["theirs"] / seconds["ours"], "x", "higher")
     for side in sides:
-        report.add_time(f"{label}_transmitter_{side}", seconds[side] / len(asked[0]))
+        report.add_time(f"{label}_transmitter_{side}", seconds[side] / len(queries[0]))
     report.add(f"{label}_set_up_ours", ours.set_up_s, "s", "lower")
     report.add(f"{label}_set_up_theirs", rival.set_up_s, "s", "lower")
-    for what, (value, unit, better) in tracers.compare(ours.paths(*asked), rival.paths(*asked)).items():
+    for what, (value, unit, better) in tracers.compare(ours.paths(*queries), rival.paths(*queries)).items():
         report.add(f"{label}_{what}", value, unit, better)
 
 

@@ -30,7 +30,7 @@ SHARED = 8
 
 @dataclass(frozen=True)
 class Size:
-    """What is rendered, and by whom besides the tiled renderer."""
+    """Size of a rendering, and the renderers that are timed besides the tiled one."""
 
     n: int
     batches: tuple[int, ...] = (1, 8, 32)
@@ -133,7 +133,7 @@ def measure_size(report: Report, effort: Effort, size: Size) -> None:
 
 
 def add_ratios(report: Report, size: Size, seconds: dict[Competitor, Seconds]) -> None:
-    """How many times faster the tiled renderer is, round by round, and what sharing a plan brings."""
+    """Adds the speed-up of the tiled renderer over the others, round by round, and the gain from sharing a plan."""
     for b in size.batches:
         own = fastest(seconds, ("render_fwd_bwd",), b)
         for ratio, figures in RATIOS.items():

@@ -1,4 +1,4 @@
-"""What the renderers are given: random Gaussians around a receiver, attenuation and signal of some queries."""
+"""Inputs of the renderers: random Gaussians around a receiver, attenuation and signal of some queries."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

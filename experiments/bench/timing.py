@@ -33,7 +33,7 @@ def half_the_memory_gb() -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Effort:
-    """How much time to spend."""
+    """Time to spend."""
 
     repeats: int = 9
     """Rounds of timed calls, after compilation."""
@@ -50,7 +50,7 @@ class Effort:
 
 @dataclasses.dataclass
 class Report:
-    """What was measured, and what was not."""
+    """Figures that were measured, and names of those that were not."""
 
     metrics: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
     skipped: dict[str, str] = dataclasses.field(default_factory=dict)

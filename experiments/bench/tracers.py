@@ -75,8 +75,8 @@ class Ours:
         result = []
         for lengths, amplitudes, kinds in zip(arrived.length, arrived.amplitude, arrived.interaction, strict=True):
             through = np.isin(kinds[0], (TRANSMITTED, DIFFRACTED)).any(-1)
-            asked = ~through & ((kinds[0] == REFLECTED).sum(-1) <= max(ORDERS)) & (np.abs(amplitudes).max(0) > 0)
-            result.append(Found(lengths[0, asked].astype(np.float64), amplitudes[:, asked]))
+            kept = ~through & ((kinds[0] == REFLECTED).sum(-1) <= max(ORDERS)) & (np.abs(amplitudes).max(0) > 0)
+            result.append(Found(lengths[0, kept].astype(np.float64), amplitudes[:, kept]))
         return result
 
 

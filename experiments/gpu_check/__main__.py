@@ -36,10 +36,10 @@ ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "experiments" / "results" / "gpu"
 RUNS = ROOT / "runs" / "gpu"
 CHEAP = {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"}
-"""Of the stand-in, which computes next to nothing: half of the time that compiling takes is for speed."""
+"""Environment of the stand-in, which computes next to nothing: optimisation takes half of the compile time."""
 MODULE = "experiments.gpu_check.pieces"
 START_S = 60.0
-"""What finding the device may take."""
+"""Seconds that finding the device may take."""
 GRACE_S = 45.0
 """A piece is interrupted so long before its process is ended: a program may have to be compiled until an epoch is over."""
 INTERRUPTED = 130

@@ -1,4 +1,4 @@
-"""What the library computes on a device: every public function that is pure, with small inputs from scene 1.
+"""Functions that the library computes on a device: every public one that is pure, with small inputs from scene 1.
 
 A test lowers each for CUDA, values and gradients; `parity.py` runs each on a GPU and beside it on the CPU. `ON_THE_HOST` names
 the other public functions; a test sees to it that each stands in one of the two.
@@ -58,7 +58,7 @@ TINY_FIELDS: dict[str, dict[str, Any]] = {"wave": TINY_WAVE, "wideband": TINY, "
 COHERENT = ("wave", "hybrid")
 """Fields that find mirror images on the host: their plans are made outside."""
 AIMS = ("mean_power", "soft_minimum", "tenth_percentile")
-"""What an antenna may be placed for."""
+"""Objectives of antenna placement."""
 SEED = 0
 
 
@@ -201,7 +201,7 @@ def images() -> list[Case]:
 
 
 def statistics() -> list[Case]:
-    """Returns the cases of how sure answers are, and of how users are served."""
+    """Returns the cases of prediction uncertainty, and of objectives over users."""
     rng = np.random.default_rng(SEED)
     places = jnp.asarray(rng.normal(size=(6, 3)), jnp.float32)
     query = wb.make_query(rng.normal(size=(B, 3)), 28e9)
@@ -225,8 +225,8 @@ def powers() -> list[Case]:
     places, receivers = rng.uniform(0, 8, (40, 3)), rng.uniform(0, 8, (3, 3))
     measured = -40 - 20 * np.log10(np.linalg.norm(places[:, None] - receivers, axis=-1)) + rng.normal(size=(40, 3))
     readings = Readings(places, measured, np.ones((40, 3)), (), receivers)
-    asked = jnp.asarray(rng.uniform(0, 8, (5, 3)), jnp.float32)
-    return [Case("received_power", functools.partial(wb.power_map.received_power, wb.power_map.learn_map(readings)), (asked,))]
+    tx = jnp.asarray(rng.uniform(0, 8, (5, 3)), jnp.float32)
+    return [Case("received_power", functools.partial(wb.power_map.received_power, wb.power_map.learn_map(readings)), (tx,))]
 
 
 @dataclass(frozen=True)
@@ -244,12 +244,12 @@ class Known:
 
     @property
     def query(self) -> Any:
-        """Of these links."""
+        """Query of the links of `index`."""
         return self.dataset.query(np.asarray(self.index))
 
     @property
     def probe(self) -> Any:
-        """Of its hooks."""
+        """Probe of the field's hooks."""
         hooks = (make_hook(name, self.settings) for name in self.field.hooks)
         return probe_of([hook for hook in hooks if hook is not None], self.params)
 
@@ -318,9 +318,9 @@ def _render(of: Known) -> Callable[..., Any]:
 
 
 def _of_waves(of: Known) -> list[Case]:
-    """Returns what only the coherent field says: snapshots and paths."""
+    """Returns the cases that only the coherent field has: snapshots and paths."""
     plan = of.field.plan(of.params, of.dataset.receiver())
-    says = {"coherent.snapshots": wb.coherent.snapshots, "coherent.channels": wb.coherent.channels}
+    functions = {"coherent.snapshots": wb.coherent.snapshots, "coherent.channels": wb.coherent.channels}
     moving = wb.applications.make_movement(of.field, B, {0: np.linspace(0, 0.1, B)[:, None] * np.ones(3)})
     following = wb.applications.plan_movement(of.field, of.params, of.dataset.receiver(), of.query.tx_position, moving)
 
@@ -328,7 +328,7 @@ def _of_waves(of: Known) -> list[Case]:
         return wb.applications.paths_over_time(params, following, of.query, moving)
 
     return [
-        *(Case(name, lambda params, do=do: do(params, plan, of.query), (of.params,)) for name, do in says.items()),
+        *(Case(name, lambda params, do=do: do(params, plan, of.query), (of.params,)) for name, do in functions.items()),
         Case("paths_over_time", over_time, (of.params,), costly=True),
     ]
 
@@ -386,4 +386,4 @@ ROOMS: dict[str, Callable[[], list[Case]]] = {
 }
 """Makers of cases."""
 SMALL_ROOMS: dict[str, Callable[[], list[Case]]] = {"splatting": functools.partial(splatting, FEW), "arrays": arrays}
-"""Those of the stand-in."""
+"""Makers of the stand-in's cases."""

@@ -33,7 +33,7 @@ from wbgs_jax.training.step import init_state, run_epoch
 RESULT = Path(__file__).parents[1] / "results" / "gpu" / "compiled.json"
 GAUSSIANS, QUERIES = (2_000, 10_000, 70_000), 8
 SLOTS = 32_768
-"""Of the epoch."""
+"""Slots for Gaussians in the epoch."""
 PLUGIN = "jax_cuda12_plugin"
 H100 = {
     "threads_per_warp": 32,
@@ -77,7 +77,7 @@ def gpu_on_paper(name: str = "H100") -> Any:
     """
     if importlib.util.find_spec(PLUGIN) is None:
         raise NotImplementedError(f"{PLUGIN} is not installed; it comes with the extra `cuda`")
-    jax.devices()  # plugins are found when a device is first asked for
+    jax.devices()  # plugins are found when devices are first requested
     major, facts = GPUS[name]
     described = " ".join(f"{fact}: {value}" for fact, value in facts.items())
     target = f'gpu_device_info {{ {described} cuda_compute_capability {{ major: {major} }} }} platform_name: "CUDA"'

@@ -1,9 +1,8 @@
 """The same values and gradients on the device as on the CPU of the same machine.
 
 Every case of `cases.py` is computed on both. Matrix products of positions and phases state their precision, so that TF32,
-which a GPU uses where nobody says otherwise, is left to the networks: a case whose program is the same whatever precision is
-asked for is `pinned`. Where there is no GPU, what is compared with the CPU's own program is the one that a GPU is given
-(`for_cuda`), run on the CPU.
+a GPU's default, is left to the networks: a case whose program is the same at every default precision is `pinned`. Where there
+is no GPU, the program that a GPU would be given (`for_cuda`) is run on the CPU and compared with the CPU's own.
 """
 
 import os
@@ -23,8 +22,8 @@ from experiments.gpu_check.record import NEEDED, NEEDED_OF_STAND_IN, Record, rou
 from wbgs_jax.splat import fused_kernels
 
 TOLERANCE = {"values": 5e-3, "gradients": 2e-2}
-"""Of the norm of a difference relative to the norm: phases at 94 GHz are known to 1e-3 radians in single precision. Positions
-in TF32 would be off by millimetres, and everything by its own size."""
+"""Bound of the norm of a difference relative to the norm: phases at 94 GHz are known to 1e-3 radians in single precision.
+Positions in TF32 would be off by millimetres, and everything by its own size."""
 IN_TF32 = 0.1
 """The same where the networks multiply as the device likes."""
 STANDS_IN = version("jaxlib").startswith("0.10.")
@@ -112,12 +111,12 @@ def compare(case: Case, reference: Any, device: Any) -> dict[str, Any]:
 
 
 def on(device: Any, case: Case) -> Any:
-    """Returns what a case says on a device."""
+    """Returns the result of a case on a device."""
     return jax.device_get(jax.jit(case.program())(*jax.device_put(case.arguments, device)))
 
 
 def for_cuda(case: Case) -> Any:
-    """Returns what the program says that a GPU would compile, run on this CPU.
+    """Returns the result of the program that a GPU would compile, run on this CPU.
 
     Raises:
         NotImplementedError: it calls code that only a GPU has, or this version's compiler cannot.

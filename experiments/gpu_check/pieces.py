@@ -22,7 +22,7 @@ from wbgs_jax.evaluation.report import device_name, environment
 from wbgs_jax.training.progress import Interrupted
 
 MEASURES: dict[str, Callable[[Record, float, bool], bool]] = {"parity": parity.measure, "renderer": renderer.measure}
-"""Of (record, deadline of `time.monotonic`, stand-in): whether all of it is done."""
+"""(record, deadline of `time.monotonic`, stand-in) -> whether all of it is done."""
 
 
 def device() -> dict[str, Any]:

@@ -42,7 +42,7 @@ class Record:
 
     @property
     def figures(self) -> dict[str, Any]:
-        """What is known."""
+        """Figures so far."""
         return self.read()["figures"]
 
     def add(self, name: str, figures: Any) -> None:

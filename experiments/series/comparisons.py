@@ -113,7 +113,7 @@ ROOMS = Experiment(
     ),
 )
 SCHEDULES = Experiment(
-    # How fast the wideband field learns, and for how long: learning rates, warm-up, what is left at the end. On validation.
+    # How fast the wideband field learns, and for how long: learning rates, warm-up, number of steps. On validation.
     "Schedules",
     (
         Series("The `cpu` preset of today", "wideband", ("",), "main", ("1", "2", "4")),

@@ -1,4 +1,4 @@
-"""What all series share: a field, its changes, where and how often each is trained, and the table of their scores."""
+"""Series: a field, its changes, where and how often each is trained, and the table of their scores."""
 
 import dataclasses
 import statistics
@@ -58,7 +58,7 @@ class Experiment:
     title: str
     series: tuple[Series, ...]
     more_jobs: tuple[Job, ...] = ()
-    """What its tables need besides."""
+    """Further jobs that its tables need."""
     tables: Callable[[Results], str] | None = None
     """Tables of its own form; by default one a series."""
 

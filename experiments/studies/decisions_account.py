@@ -1,4 +1,4 @@
-"""What decisions by evidence rest on, how often they take the harmful side: `python -m experiments.studies.decisions_account`.
+"""Evidence of decisions, and how often they take the harmful side: `python -m experiments.studies.decisions_account`.
 
 Writes experiments/results/decisions.json: for every decision, how many transmitters it has in the data that are at hand; and,
 from stored scores of pairs of trainings on the same test transmitters, how often one of them is taken for better by n
@@ -44,7 +44,7 @@ FEWEST = 100
 
 
 class Decision(NamedTuple):
-    """What is decided, by what, and what stands where evidence is missing."""
+    """Decision, its evidence, and its outcome where evidence is missing."""
 
     name: str
     spectra: int
@@ -54,7 +54,7 @@ class Decision(NamedTuple):
     errors: float
     """Standard errors by which a change has to be better; 0 where it is no test."""
     harmless: str
-    """What stands without evidence."""
+    """Outcome without evidence."""
 
 
 def decisions() -> tuple[Decision, ...]:

@@ -42,12 +42,12 @@ class Command:
     """Folder of the trainings, which is kept: those that are finished there are not repeated."""
 
 
-def start(kind: str, folder: Path, fields: tuple[str, ...], **told: str) -> subprocess.Popen:
+def start(kind: str, folder: Path, fields: tuple[str, ...], **variables: str) -> subprocess.Popen:
     """Starts a process that trains the fields."""
     flags = f"--xla_force_host_platform_device_count={4 if kind == 'four' else 1}"
     # More devices than cores, and other work on the machine: XLA's own patience is too short.
     flags += " --xla_cpu_collective_call_terminate_timeout_seconds=1200 --xla_cpu_collective_timeout_seconds=1200"
-    environ = os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags} | told
+    environ = os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags} | variables
     return subprocess.Popen([sys.executable, "-m", "experiments.studies.devices_part", kind, str(folder), *fields], env=environ)
 
 
@@ -57,8 +57,8 @@ def run(kind: str, folder: Path, fields: tuple[str, ...]) -> None:
     if kind == "two":
         with socket.socket() as free:
             free.bind(("localhost", 0))
-            told = {COORDINATOR: f"localhost:{free.getsockname()[1]}", COUNT: "2"}
-        started = [start(kind, folder, fields, **told, **{NUMBER: str(number)}) for number in range(2)]
+            variables = {COORDINATOR: f"localhost:{free.getsockname()[1]}", COUNT: "2"}
+        started = [start(kind, folder, fields, **variables, **{NUMBER: str(number)}) for number in range(2)]
     for process in started:
         if process.wait():
             raise SystemExit(f"the run of kind {kind} failed")

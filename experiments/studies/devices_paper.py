@@ -1,4 +1,4 @@
-"""What the measured parts of a step say of more devices than there are here: times on paper.
+"""Times on paper of a step on more devices than there are here, from its measured parts.
 
     T(D, B) = shared + spectrum B / D + exchange(D)        exchange(D) = 2 (D - 1) / D  bytes / bandwidth + 2 log2(D) latency
 
@@ -14,11 +14,11 @@ DEVICES = (1, 2, 4, 8, 16, 32, 64)
 LINKS = {"within_a_machine": (100e9, 5e-6), "between_machines": (10e9, 30e-6)}
 """Bytes a second and seconds of latency: NVLink or PCIe 5, and 100-gigabit Ethernet."""
 FASTER = {"cpu": 1.0, "fifty_times": 50.0}
-"""How much faster than the measured processor a device computes: the exchange does not become faster with it."""
+"""Factors by which a device computes faster than the measured processor; the exchange does not become faster with it."""
 SCENES, FIXED = 1000, 64
 """Scenes, and the links of a batch that all sizes share in strong scaling."""
 SCENE_S = 700.0
-"""Of the hybrid field's `cpu` preset (docs/architecture.md: `Field.seconds`), on two cores."""
+"""Seconds per scene with the hybrid field's `cpu` preset (docs/architecture.md: `Field.seconds`), on two cores."""
 
 
 def step_s(parts: dict[str, Any], devices: int, batch: int, link: str, faster: float = 1.0) -> float:

@@ -1,7 +1,7 @@
-"""What fields are worth to who locates transmitters or chooses beams: `python -m experiments.studies.downstream`.
+"""Value of fields for locating transmitters and choosing beams: `python -m experiments.studies.downstream`.
 
 For scenes 1, 2 and 4, and 10, 40, 160 and all training transmitters, a small coherent field is trained into
-runs/downstream/SCENE_txNUMBER (used where it is there, gone on with where it was cut) and asked
+runs/downstream/SCENE_txNUMBER (used where it exists, resumed where it was interrupted). It predicts
 
 * where held-out transmitters stand that are observed as spectra at a few frequencies, beside the place of the training
   transmitter whose spectra are most alike, and the mean of the four most alike ones, weighted by likeness;
@@ -57,7 +57,7 @@ SETTINGS = (
 """A small coherent field: fewer paths, one round of the search for materials, few steps."""
 STEPS = 100
 PARTS = {"localisation", "beams"}
-"""Of a row; `account` makes those that are missing."""
+"""Parts of a row; `account` makes those that are missing."""
 ALIKE = 4
 """Training transmitters whose places are averaged."""
 
@@ -78,7 +78,7 @@ class Command:
     """Metres between places of the grid."""
     part: Literal["test", "validation"] = "test"
     settings: tuple[str, ...] = SETTINGS
-    """Of the training."""
+    """Settings of the training."""
     tables: bool = False
     """Print the tables of docs/applications.md, of the rows that are there, and make none."""
     runs: Path = RUNS
@@ -120,8 +120,8 @@ def trained_field(command: Command, scene: str, folder: Path, number: int) -> Tr
 def account(trained: TrainedField, command: Command, parts: set[str]) -> dict[str, Any]:
     """Returns scores of localisation and of beams on held-out transmitters, as far as they are wanted."""
     own = trained.dataset()
-    asked = transmitters_of(own, own.test if command.part == "test" else own.validation)
-    chosen = np.sort(np.random.default_rng(0).permutation(asked)[: command.transmitters])
+    held_out = transmitters_of(own, own.test if command.part == "test" else own.validation)
+    chosen = np.sort(np.random.default_rng(0).permutation(held_out)[: command.transmitters])
     return {
         **({"localisation": localisation(trained, own, chosen, command)} if "localisation" in parts else {}),
         **({"beams": beams(trained, own, command.part)} if "beams" in parts else {}),
@@ -176,17 +176,17 @@ def localisation(trained: TrainedField, dataset: Dataset, chosen: Int[np.ndarray
 
 
 def fingerprints(
-    dataset: Dataset, known: Int[np.ndarray, "m freq"], asked: Int[np.ndarray, "n freq"]
+    dataset: Dataset, known: Int[np.ndarray, "m freq"], tested: Int[np.ndarray, "n freq"]
 ) -> Float[np.ndarray, "n m"]:
     """Returns one minus the cosine between the spectra of transmitters, as the locator compares them."""
 
-    def told(links: Int[np.ndarray, "k freq"]) -> Float[np.ndarray, "k numbers"]:
+    def features(links: Int[np.ndarray, "k freq"]) -> Float[np.ndarray, "k numbers"]:
         spectra = np.stack([np.asarray(pooled(jnp.asarray(dataset.pas(row)))) for row in links])
         flat = spectra.reshape(*links.shape, -1)
         flat = flat / np.linalg.norm(flat, axis=-1, keepdims=True) / np.sqrt(links.shape[1])
         return flat.reshape(len(links), -1)
 
-    return 1 - told(asked) @ told(known).T
+    return 1 - features(tested) @ features(known).T
 
 
 def by_fingerprint(unlike: Float[np.ndarray, "n m"], places: Float[np.ndarray, "m 3"]) -> dict[str, Float[np.ndarray, "n 3"]]:

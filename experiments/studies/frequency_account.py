@@ -1,4 +1,4 @@
-"""What the frequency can say of a spectrum to a law that is smooth in it: `python -m experiments.studies.frequency_account`.
+"""Value of the frequency to a law of the spectrum that is smooth in it: `python -m experiments.studies.frequency_account`.
 
 Nothing is trained. Every spectrum of the validation transmitters is predicted from the *true* spectra of the same transmitter
 at the other frequencies: by their mean, which needs no frequency, by the four nearest and the four farthest, and pixel by pixel
@@ -27,12 +27,12 @@ from wbgs_jax.evaluation.report import environment
 NEIGHBOURS = 4
 Spectra = Float[np.ndarray, "f 90 360"]
 Others = Callable[[Spectra, Float[np.ndarray, " f"], float], Float[np.ndarray, "90 360"]]
-"""(spectra of the other frequencies, logarithms of these, logarithm of the one asked for) -> prediction."""
+"""(spectra of the other frequencies, logarithms of these, logarithm of the predicted one) -> prediction."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """Score what a transmitter's spectra at other frequencies say about one."""
+    """Score predictions of a spectrum from the transmitter's spectra at other frequencies."""
 
     data: tyro.conf.Positional[tuple[str, ...]] = ("1", "2", "3", "4", "5", "6")
     """Released scenes, scene files or folders of the published layout."""
@@ -50,26 +50,26 @@ def main() -> None:
     write_json(command.out / "frequency_account.json", {"scenes": scenes} | environment())
 
 
-def mean(spectra: Spectra, logs: Float[np.ndarray, " f"], asked: float) -> Float[np.ndarray, "90 360"]:
+def mean(spectra: Spectra, logs: Float[np.ndarray, " f"], wanted: float) -> Float[np.ndarray, "90 360"]:
     """Returns the mean of all other frequencies."""
     return spectra.mean(0)
 
 
-def nearest(spectra: Spectra, logs: Float[np.ndarray, " f"], asked: float) -> Float[np.ndarray, "90 360"]:
+def nearest(spectra: Spectra, logs: Float[np.ndarray, " f"], wanted: float) -> Float[np.ndarray, "90 360"]:
     """Returns the mean of the nearest frequencies."""
-    return spectra[np.argsort(np.abs(logs - asked))[:NEIGHBOURS]].mean(0)
+    return spectra[np.argsort(np.abs(logs - wanted))[:NEIGHBOURS]].mean(0)
 
 
-def farthest(spectra: Spectra, logs: Float[np.ndarray, " f"], asked: float) -> Float[np.ndarray, "90 360"]:
+def farthest(spectra: Spectra, logs: Float[np.ndarray, " f"], wanted: float) -> Float[np.ndarray, "90 360"]:
     """Returns the mean of the farthest frequencies."""
-    return spectra[np.argsort(np.abs(logs - asked))[-NEIGHBOURS:]].mean(0)
+    return spectra[np.argsort(np.abs(logs - wanted))[-NEIGHBOURS:]].mean(0)
 
 
 def polynomial(degree: int, slope: float = 1) -> Others:
     """Returns the prediction by a polynomial in every pixel; the terms but the mean are multiplied by `slope`."""
 
-    def predict(spectra: Spectra, logs: Float[np.ndarray, " f"], asked: float) -> Float[np.ndarray, "90 360"]:
-        powers = np.vander(np.append(logs, asked) - logs.mean(), degree + 1, increasing=True)
+    def predict(spectra: Spectra, logs: Float[np.ndarray, " f"], wanted: float) -> Float[np.ndarray, "90 360"]:
+        powers = np.vander(np.append(logs, wanted) - logs.mean(), degree + 1, increasing=True)
         powers[:, 1:] -= powers[:-1, 1:].mean(0)  # so that the constant is the mean
         weights = (powers[-1] * np.append(1, np.full(degree, slope))) @ np.linalg.pinv(powers[:-1])
         return np.clip(np.tensordot(weights, spectra, 1), 0, 1)

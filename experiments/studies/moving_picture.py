@@ -50,7 +50,7 @@ class Command:
     per_stop: int = 3
     """Frequencies at each, in turn."""
     frame_ms: int = 600
-    """How long a frame is shown."""
+    """Duration of a frame."""
 
 
 def links_of_walk(dataset: Dataset, count: int, per_stop: int) -> Int[np.ndarray, " frames"]:
@@ -72,13 +72,13 @@ def draw_frame(
     link: int,
     way: Float[np.ndarray, "n 3"],
     truth: Float[np.ndarray, "90 360"],
-    said: Float[np.ndarray, "90 360"],
+    predicted: Float[np.ndarray, "90 360"],
 ) -> Figure:
     """Returns one frame: the floor plan on the left, truth and prediction on the right."""
     place = dataset.tx_positions[link]
     figure = Figure(figsize=(9.6, 3.3), layout="constrained")
-    axes = figure.subplot_mosaic([["map", "truth"], ["map", "said"]], width_ratios=(1.25, 1))
-    left, above, below = axes["map"], axes["truth"], axes["said"]
+    axes = figure.subplot_mosaic([["map", "truth"], ["map", "predicted"]], width_ratios=(1.25, 1))
+    left, above, below = axes["map"], axes["truth"], axes["predicted"]
     left.add_collection(LineCollection(list(cut_at(dataset, float(place[2]))), colors="0.35", linewidths=0.8))
     left.plot(*way[:, :2].T, "-", color="0.75", lw=0.8)
     rx = np.asarray(dataset.receiver().position)
@@ -86,8 +86,8 @@ def draw_frame(
     left.plot(*place[:2], "o", color="#d55e00", ms=9, label="transmitter")
     left.set(aspect="equal", title=f"{dataset.frequencies_hz[link] / 1e9:g} GHz", xlabel="x [m]", ylabel="y [m]")
     left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.25), ncols=2, frameon=False, fontsize=9)
-    score = float(ssim(said[None], truth[None])[0])
-    for axis, image, title in ((above, truth, "truth"), (below, said, f"prediction, SSIM {score:.2f}")):
+    score = float(ssim(predicted[None], truth[None])[0])
+    for axis, image, title in ((above, truth, "truth"), (below, predicted, f"prediction, SSIM {score:.2f}")):
         axis.imshow(image, vmin=0, vmax=1, cmap="viridis", extent=(-180, 180, 90, 0), aspect="auto")
         axis.set_title(title, fontsize=10)
         axis.set_yticks((0, 45, 90))
@@ -115,9 +115,9 @@ def main() -> None:
     trained = load_trained(command.run)
     dataset = trained.dataset()
     links = links_of_walk(dataset, command.transmitters, command.per_stop)
-    said, truth = np.asarray(observe(trained, dataset, links).pas), np.asarray(dataset.pas(links))
+    predicted, truth = np.asarray(observe(trained, dataset, links).pas), np.asarray(dataset.pas(links))
     way = dataset.tx_positions[links]
-    frames = [as_image(draw_frame(dataset, int(link), way, t, s)) for link, t, s in zip(links, truth, said, strict=True)]
+    frames = [as_image(draw_frame(dataset, int(link), way, t, s)) for link, t, s in zip(links, truth, predicted, strict=True)]
     with atomic_write(command.out) as stream:
         frames[0].save(
             stream, format="gif", save_all=True, append_images=frames[1:], duration=command.frame_ms, loop=0, optimize=True

@@ -1,4 +1,4 @@
-"""What neighbours are worth beside a trained field: `python -m experiments.studies.neighbours_account RUN [RUN ...]`.
+"""Value of neighbours beside a trained field: `python -m experiments.studies.neighbours_account RUN [RUN ...]`.
 
 Every run folder is one of `wbgs-jax train` on data of one receiver. Its field is scored on the test alone and with its
 neighbours, beside the nearest transmitter. Writes experiments/results/neighbours.json; docs/inference.md quotes it.
@@ -38,9 +38,9 @@ def main() -> None:
     for run in command.runs:
         trained = load_trained(run)
         dataset = trained.dataset()
-        asked, _ = evaluate(trained, dataset)
+        corrected, _ = evaluate(trained, dataset)
         alone, _ = evaluate(dataclasses.replace(trained, correction=None), dataset)
-        scores = {"alone": alone, "asked": asked, "nearest_tx": asked["baselines"]["nearest_tx"]}
+        scores = {"alone": alone, "asked": corrected, "nearest_tx": corrected["baselines"]["nearest_tx"]}
         report[dataset.name] = {name: {key: values[key] for key in KEPT} for name, values in scores.items()}
         report[dataset.name]["neighbours"] = 0 if trained.correction is None else len(trained.correction.images)
         print(dataset.name, report[dataset.name], file=sys.stderr)

@@ -1,4 +1,4 @@
-"""What a coherent field knows of receivers that it never heard: `python -m experiments.studies.receivers_account RUN ...`.
+"""Accuracy of a coherent field at receivers without training data: `python -m experiments.studies.receivers_account RUN ...`.
 
 Every run folder is one of `wbgs-jax train --field wave` on a released scene; scenes traced for other receivers of the same room
 are `<scene>_rx<number>.npz` beside it. Transmitters that were trained or validated are left out at all of them. A run on

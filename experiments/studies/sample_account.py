@@ -1,4 +1,4 @@
-"""What the coherent field explains of the published sample: `python -m experiments.studies.sample_account FOLDER`.
+"""Explanation of the published sample by the coherent field: `python -m experiments.studies.sample_account FOLDER`.
 
 Nothing is trained: every surface is plasterboard of 0.1 m, paths are taken away one kind at a time. The array sees directions
 above its horizon; of a line of sight from below only side lobes are in the picture. Writes
@@ -46,7 +46,7 @@ SEARCHED = 96
 
 @dataclass(frozen=True)
 class Command:
-    """Score what the mesh alone says about a sample, with isotropic antennas and with those that its spectra tell of."""
+    """Score predictions of a sample from the mesh alone, with isotropic antennas and with those estimated from its spectra."""
 
     data: tyro.conf.Positional[str]
     """Folder of the published layout."""
@@ -96,7 +96,7 @@ def keep(prepared: coherent.PreparedPaths, mask: np.ndarray) -> coherent.Prepare
 
 @jax.jit
 def observe(field: Calibratable, params: Any, plan: Any, links: Links) -> Observation:
-    """Returns what the field says of links whose paths are given."""
+    """Returns the field's prediction for links whose paths are given."""
     return field.render(params, plan, links)._replace(paths=None)
 
 

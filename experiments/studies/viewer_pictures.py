@@ -67,7 +67,7 @@ SCRIPT = """() => {
 FIRST = "Spectrum at the receiver, predicted"
 """Words on the page as soon as there is a prediction."""
 HARMLESS = "Computed radius is NaN"
-"""What viser 1.1 says of any Gaussians."""
+"""Message of viser 1.1 for any Gaussians."""
 SETTLED_S = 2.5
 """Seconds that a browser without a graphics card takes to draw what has arrived."""
 
@@ -91,7 +91,7 @@ class Window:
     page: Any
     """Playwright's."""
     errors: list[str] = field(default_factory=list)
-    """What the page's console complained of."""
+    """Errors in the page's console."""
 
     def shot(self, path: Path, settle: float = SETTLED_S) -> None:
         """Waits until all is drawn, and takes a small picture."""

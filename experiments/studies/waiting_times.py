@@ -1,4 +1,4 @@
-"""How long a person waits: `python -m experiments.studies.waiting_times`, experiments/results/waiting_times.json.
+"""Waiting times of users: `python -m experiments.studies.waiting_times`, experiments/results/waiting_times.json.
 
 Every case trains and evaluates as the two commands of the README do, first with an empty cache of compiled programs and then
 with the one that this has filled: wall times, the duration that was announced, the longest time without a line, and the scores.

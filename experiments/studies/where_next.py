@@ -1,4 +1,4 @@
-"""How many readings a map of received power needs, by how their places are chosen: `python -m experiments.studies.where_next`,
+"""Readings that a map of received power needs, by how their places are chosen: `python -m experiments.studies.where_next`,
 experiments/results/where_next.json.
 
 A quarter of the places of a measured set is held out; measuring begins at five random ones of the others and continues in

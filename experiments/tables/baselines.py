@@ -34,7 +34,7 @@ def baseline_average(results: Results, job: Job, name: str) -> float | None:
 
 
 def render(results: Results, images: Path) -> str:
-    """Two tables: without learning, and the volume on the transmitters it was asked for."""
+    """Returns two tables: without learning, and the volume on the transmitters it was scored on."""
     return "\n\n".join([without_learning(results), volume(results)])
 
 

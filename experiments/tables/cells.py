@@ -1,4 +1,4 @@
-"""What tables are made of: scores of a row over its seeds, cells with the paper's value, and marks for what was not run."""
+"""Parts of tables: scores of a row over its seeds, cells with the paper's value, and marks for what was not run."""
 
 import functools
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ NAMES = {
     ("wrfgs", "longest"): "WRF-GS, 10x samples",
     ("nerf2", ""): "NeRF2-style",
 }
-"""Of fields and variants, for people."""
+"""Names of fields and variants in tables."""
 
 
 def scores(results: Results, jobs: Sequence[Job], ghz: Sequence[float] = (), tx: Sequence[int] = ()) -> Scores | None:

@@ -1,4 +1,4 @@
-"""What a user gets who asks for nothing: evaluations of the hybrid field on the released scenes and on others' data.
+"""Results with default settings: evaluations of the hybrid field on the released scenes and on others' data.
 
 They are no jobs of the runner but files that `wbgs-jax eval --results experiments/results` wrote, each with its command.
 """

@@ -18,9 +18,9 @@ PANELS = {
     "snapshot SNR (dB)": {"no noise": "", "30": "snr_30", "20": "snr_20", "10": "snr_10"},
     "training transmitters": {"all": "", "100": "tx_100", "20": "tx_20"},
 }
-"""Of every panel what gets worse from left to right, and the variants."""
+"""Quantity of every panel, which gets worse from left to right, and the variants."""
 COLOURS = {"1": "C0", "2": "C1", "4": "C2"}
-"""Of the scenes."""
+"""Colours of the scenes."""
 LINES = {"hybrid": "-", "coherent, no corrections": ":", "wideband alone": "--"}
 
 

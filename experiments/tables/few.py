@@ -1,4 +1,4 @@
-"""What one command makes of few spectra (experiments/few.py): a row a case, worst and median over its seeds."""
+"""Scores of one command on few spectra (experiments/few.py): a row per case, worst and median over its seeds."""
 
 from pathlib import Path
 

@@ -23,7 +23,7 @@ def jobs() -> list[Job]:
 
 
 def render(results: Results, images: Path) -> str:
-    """A picture a scene: a row a model, a column a frequency and a held-out transmitter."""
+    """Returns a picture per scene: a row per model, a column per frequency and held-out transmitter."""
     note = (
         "Every column is another held-out transmitter, drawn without a look at the results; in a picture zenith runs down from"
         " 0 to 90 degrees, azimuth to the right, and colours go from 0 (dark) to 1. Above each prediction stands its SSIM."
@@ -45,7 +45,7 @@ def scene_picture(results: Results, images: Path, scene: str) -> str:
 
 
 def truth_of(job: Job) -> Float[np.ndarray, "k 90 360"]:
-    """What the pictures of a scene should look like."""
+    """Returns the truth of a scene's pictures."""
     dataset = job.dataset()
     return np.asarray(dataset.pas(dataset.test[pictured(dataset)]))
 

@@ -14,7 +14,7 @@ from experiments.tables.plots import save
 
 TITLE = "Figure 6: training loss"
 WINDOW = 0.1
-"""Of the moving average, as a share of the training (the paper's: 7,500 spectra)."""
+"""Width of the moving average, as a share of the training (the paper's: 7,500 spectra)."""
 
 
 def jobs() -> list[Job]:

@@ -66,7 +66,7 @@ def gain_cells(values: dict[tuple[str, str], Scores | None], model: tuple[str, s
 
 
 def by_frequency(values: dict[tuple[str, str], Scores | None]) -> str:
-    """A row a frequency."""
+    """Returns a table with one row per frequency."""
     rows = []
     for i, ghz in enumerate(GHZ_21):
         paper = FIGURE_7_POINTS.get(ghz, {})

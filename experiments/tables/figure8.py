@@ -33,7 +33,7 @@ def jobs_of(letter: str) -> list[Job]:
 
 
 def held_out() -> list[Job]:
-    """Combination D asked for transmitters that are new as well."""
+    """Returns the jobs of combination D at transmitters that are new as well."""
     return [Job(DENSE_SCENE, "wideband", "D", seed=seed) for seed in SEEDS]
 
 

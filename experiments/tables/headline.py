@@ -1,5 +1,5 @@
-"""What the results come to: wideband against WRF-GS, a model a frequency and pooled, where the curve leads, and what unseen
-frequencies cost."""
+"""Summary of the results: wideband against WRF-GS, a model per frequency and pooled, the end of the curve, and the loss at
+unseen frequencies."""
 
 from pathlib import Path
 
@@ -38,7 +38,7 @@ CURVE = {
     "WRF-GS, a model a frequency": ("wrfgs", ("", "long", "longest")),
     "NeRF2-style": ("nerf2", ("", "long")),
 }
-"""What is on the curve: a field, and its variants with one, five and ten times the spectra."""
+"""Entries of the curve: a field, and its variants with one, five and ten times the spectra."""
 UNSEEN = [float(f) for f in GHZ_21 if f not in COMBINATIONS["D"]]
 NOTE = (
     "**Gain over WRF-GS** with equal numbers of spectra seen; *pooled* is one WRF-GS model for all frequencies without a"

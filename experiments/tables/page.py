@@ -86,7 +86,7 @@ LONG_INTRODUCTION = """Reference tables of the [results](results.md), where mode
 
 
 def introduction(name: str) -> str:
-    """What is compared, and with which effort."""
+    """Returns the introduction: what is compared, and with which effort."""
     suffix = "" if name == "quick" else f"_{name}"
     return INTRODUCTION.format(name=name, suffix=suffix, effort=profile_text(PROFILES[name]))
 
@@ -99,7 +99,7 @@ def profile_text(profile: Profile) -> str:
 
 
 def provenance(results: Results) -> str:
-    """How much has been run, where, with which code."""
+    """Returns how much has been run, where, with which code."""
     jobs = unique_jobs()
     found = results.all(jobs)
     if not found:

@@ -1,4 +1,4 @@
-"""What the figures share: how a curve of a model looks, and saving."""
+"""Parts that the figures share: the style of a model's curve, and saving."""
 
 from pathlib import Path
 from typing import Any
