@@ -32,8 +32,10 @@ CHECKED = (
     "wbgs_jax/fields",
     "wbgs_jax/training",
     "data_gen",
+    "experiments",
+    "tools",
 )
-"""Packages and modules whose text is checked; to be extended to all of `wbgs_jax` and `experiments`."""
+"""Packages and modules whose text is checked."""
 INSTEAD = {
     r"\btold\b": "name the quantity: features, settings, reported",
     r"\b(nobody|somebody|anybody)\b": "use the passive, or name the part",
