@@ -47,8 +47,10 @@ class Command:
     """Print only the report on stdout, as one JSON object."""
     pictures: bool = True
     """Write figures into the run folder."""
+    timing: bool = False
+    """Also measure the time of a query, in blocks and alone; compiling for it takes a while."""
     results: Path | None = None
-    """Also write quality_<dataset>_<field>_<preset>_<device>.json with provenance into this folder."""
+    """Also write quality_<dataset>_<field>_<preset>_<device>.json with provenance and times into this folder."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -63,7 +65,8 @@ def main(arguments: list[str] | None = None) -> None:
     console = Console(file=sys.stderr, markup=False, soft_wrap=True)
     index = held_out(dataset, command.part)
     console.print(f"evaluating {command.run} (step {trained.step}) on {len(index)} spectra of {dataset.name} ...")
-    report, predicted = evaluate(trained, dataset, command.part, shown=True)
+    timed = command.timing or command.results is not None
+    report, predicted = evaluate(trained, dataset, command.part, shown=True, timed=timed)
     beside = "" if command.data is None else f"-{dataset.name}"  # scores on other data never replace the run's own
     write_json(command.run / f"{with_part('eval', command.part)}{beside}.json", report)
     if command.data is None and (command.run / MANIFEST).exists():

@@ -160,5 +160,6 @@ def closing_lines(report: dict[str, Any], block: int) -> list[str]:
             f"{100 * intervals['level']:.0f} % intervals contain {100 * intervals['coverage']:.0f} % of the scores; "
             f"mean SSIM of the more certain half {intervals['risk_coverage']['0.5']:.3f}"
         )
-    single = report["ms_per_pas_single"]
-    return [*lines, f"{report['ms_per_pas']:.2f} ms per PAS in blocks of {block}, {single:.2f} ms for a single query"]
+    if single := report.get("ms_per_pas_single"):
+        lines.append(f"{report['ms_per_pas']:.2f} ms per PAS in blocks of {block}, {single:.2f} ms for a single query")
+    return lines
