@@ -28,7 +28,6 @@ from wbgs_jax.evaluation.report import environment
 from wbgs_jax.fields import mixture
 from wbgs_jax.fields.mixture import SHARES
 from wbgs_jax.training import fit_kriging
-from wbgs_jax.training.calibration import alignment, antennas, material_fit, obstacles, pipeline
 from wbgs_jax.training.calibration.objective import surely_better
 from wbgs_jax.training.fit_mixture import ERRORS, ERRORS_WITH_PATHS, choose_share
 from wbgs_jax.training.loop import VALIDATION_LINKS
@@ -63,12 +62,12 @@ def decisions() -> tuple[Decision, ...]:
     return (
         Decision("antennas", own.antenna_spectra, "train", own.antenna_n_sigma, "isotropic, or what the data name"),
         Decision("materials, against the list", own.spectra, "train", own.n_sigma, "an entry of the list"),
-        Decision("thicknesses", own.thickness_spectra, "train", material_fit.SURE, "the thickness that is there"),
-        Decision("absent bodies", own.spurious_spectra, "train", obstacles.SURE, "all bodies are there"),
-        Decision("idealisations", own.propagation_spectra, "train", pipeline.SURE, "as ray tracers have it"),
-        Decision("array tuning", own.array_gain_spectra // 2, "train", antennas.SURE, "elements in tune"),
-        Decision("geometry", own.geometry_snapshots, "train", alignment.SURE, "the mesh as it is"),
-        Decision("clutter", own.absorption_spectra, "train", obstacles.SURE_OF_CLUTTER, "none"),
+        Decision("thicknesses", own.thickness_spectra, "train", own.thickness_n_sigma, "the thickness that is there"),
+        Decision("absent bodies", own.spurious_spectra, "train", own.spurious_n_sigma, "all bodies are there"),
+        Decision("idealisations", own.propagation_spectra, "train", own.propagation_n_sigma, "as ray tracers have it"),
+        Decision("array tuning", own.array_gain_spectra // 2, "train", own.array_gain_n_sigma, "elements in tune"),
+        Decision("geometry", own.geometry_snapshots, "train", own.geometry_n_sigma, "the mesh as it is"),
+        Decision("clutter", own.absorption_spectra, "train", own.absorption_n_sigma, "none"),
         Decision("noise floor", mixture.COMPARED, "validation", mixture.SURE, "none"),
         Decision("shares of the two fields by query", VALIDATION_LINKS, "validation", 1.0, "one share for all"),
         Decision("residuals of neighbours", fit_kriging.SCORED, "validation", fit_kriging.SURE, "not used; never below 20"),

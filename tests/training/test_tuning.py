@@ -9,6 +9,7 @@ import pytest
 from builders.synthetic import tiny_settings
 from builders.wave_runs import PARTS, REFLECTIONS, places, run_in
 
+from wbgs_jax.config import CalibrationConfig
 from wbgs_jax.fields import coherent
 from wbgs_jax.training.calibration.antennas import least_squares, search_tuning
 from wbgs_jax.training.calibration.objective import CalibrationProblem
@@ -55,7 +56,7 @@ def heard_by(run, field, params):
 def searched(run, heard, folder, rng):
     own = run_in(PARTS, SETTINGS, folder, PLACES, FREQUENCIES, heard)
     problem = CalibrationProblem(own.field, own.prepared, own.data, rng.permutation(own.dataset.train))
-    return own.field, *search_tuning(run.state.params, problem, 200)
+    return own.field, *search_tuning(run.state.params, problem, CalibrationConfig(array_gain_spectra=200))
 
 
 @pytest.mark.heavy

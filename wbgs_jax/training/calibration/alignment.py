@@ -158,9 +158,6 @@ MOST = 5
 """Maximum number of these repetitions for a free receiver, which can be far from its nominal position: correctly placed walls
 that have compensated for it return slowly. Positions are estimated again until the receiver moves by less than a standard
 deviation of a held one."""
-SURE = 2.0
-"""n_sigma: standard errors over transmitters by which the result must fit better (`surely_better`); low, since the mesh has
-already been found to be inaccurate."""
 
 
 @dataclass(frozen=True)
@@ -347,7 +344,7 @@ def _started(place: Place, observed: _Observed, links: Links) -> Place:
 def _surely_better(place: Place, other: Place, observed: _Observed, links: Links) -> bool:
     """Returns whether spectra fit significantly better with one candidate than with another."""
     _, (ours, others), tx = observed.compared([_retraced(one, one.params, links, observed.data) for one in (place, other)])
-    return surely_better(others - ours, tx, SURE)
+    return surely_better(others - ours, tx, observed.config.geometry_n_sigma)
 
 
 def _aligned(now: Place, observed: _Observed, links: Links, receiver: tuple[float, float], named: bool) -> Place:
@@ -409,7 +406,7 @@ def _accepted(place: Place, moved: list[Place], observed: _Observed) -> tuple[Pl
     nominal one; the likelihood of snapshots is not used, since it tolerates an inaccurate mesh with a large uncertainty."""
     (as_it_was, *others), (before, *after), tx = observed.compared([place, *moved])
     best = int(np.argmin([own.mean() for own in after]))
-    kept = surely_better(before - after[best], tx, SURE)
+    kept = surely_better(before - after[best], tx, observed.config.geometry_n_sigma)
     chosen = others[best]
     sizes, bodies = _sizes(chosen.field.motion), _bodies(chosen.field, chosen.known)
     unchanged = not kept or all(same(*(getattr(one.params, end) for one in (as_it_was, chosen))) for end in ENDS)

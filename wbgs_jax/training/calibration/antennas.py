@@ -173,8 +173,6 @@ def gains_of_chosen(scores: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " n"]
 
 FEWEST = 32
 """Minimum number of snapshots of a receiver; with fewer its array is not calibrated."""
-SURE = 3.0
-"""n_sigma: standard errors over transmitters by which the gains must improve the fit (`surely_better`)."""
 
 
 @dataclass(frozen=True)
@@ -193,17 +191,19 @@ class TuningReport:
     """Standard deviation of the amplitudes of elements."""
 
 
-def search_tuning(params: WaveParams, problem: CalibrationProblem, count: int) -> tuple[Calibratable, TuningReport]:
+def search_tuning(
+    params: WaveParams, problem: CalibrationProblem, config: CalibrationConfig
+) -> tuple[Calibratable, TuningReport]:
     """Returns the field with calibrated array gains if these fit significantly better, else unchanged. `params` are its
-    parameters, and `problem` has snapshots; `count` spectra are used: the gains are estimated on half of them and tested on the
-    other half."""
+    parameters, and `problem` has snapshots; of the `array_gain_spectra`, half serve to estimate the gains, half to test
+    them."""
     field, links = problem.field, problem.data.links
-    chosen = problem.spectra[:count]
+    chosen = problem.spectra[: config.array_gain_spectra]
     half = np.unique(np.asarray(links.tx_index)[chosen], return_inverse=True)[1] % 2 == 0
     tuned = field.with_gains(gains_of(field, params, problem, chosen[half]))
     held_out = dataclasses.replace(problem, spectra=chosen[~half])
     before, after = (dataclasses.replace(held_out, field=one).scores(compared="spectra")([params])[0] for one in (field, tuned))
-    kept = surely_better(before - after, held_out.tx_index(), SURE)
+    kept = surely_better(before - after, held_out.tx_index(), config.array_gain_n_sigma)
     phase, amplitude = (np.sqrt(np.mean(np.square(part - part.mean()))) for part in _parts(tuned))
     report = TuningReport(float(before.mean()), float(after.mean()), kept, float(np.rad2deg(phase)), float(amplitude))
     return tuned if kept else field, report

@@ -184,8 +184,6 @@ ONCE_MORE = 60
 first few spectra."""
 ENTRIES = 6
 """Number of entries of the list that are tried at higher frequencies: those of the best slabs."""
-SURE = 2.0
-"""n_sigma: standard errors over transmitters by which the gain must be significant (`surely_better`)."""
 
 
 class Slab(NamedTuple):
@@ -229,7 +227,7 @@ def search_slabs(
     params, likely = _sized(named, unknown, problem, config, compared, likely)
     sized, anew = search_materials(params, problem, count, once, compared)
     before, after = score([named, sized])
-    if not surely_better(before - after, problem.tx_index(count), SURE):
+    if not surely_better(before - after, problem.tx_index(count), config.thickness_n_sigma):
         return named, report, likely
     thick = unknown_mm(sized.materials, known)
     return sized, dataclasses.replace(anew, before=report.before, thickness_mm=thick), likely

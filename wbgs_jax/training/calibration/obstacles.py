@@ -46,9 +46,6 @@ MOST = 512
 """Maximum number of rigid bodies that are tested, those with the largest facets."""
 CLOSELY = 32
 """Number of rigid bodies that are tested on all spectra: those without which the first few fit best."""
-SURE, SURE_OF_ONE = 2.0, 2.5
-"""n_sigma: standard errors over transmitters by which the gain of a pass must be significant (`surely_better`), and that of a
-single body, which is higher since there are many."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +87,7 @@ def search_absent(
         fewer = dataclasses.replace(problem, field=field, prepared=field.prepare(problem.data.links, problem.data.receivers))
         others, _ = search_materials(_carried(params, field), fewer, config.spectra, once)
         after = _explained(others, dataclasses.replace(fewer, spectra=held_out.spectra), config)
-        if not surely_better(now - after, tx, SURE):
+        if not surely_better(now - after, tx, config.spurious_n_sigma):
             break
         middles = np.asarray(centres(problem.field.facets, len(problem.field.motion.shift)))[movers]
         where += np.round(middles.astype(float), 3).tolist()
@@ -123,12 +120,13 @@ def absent_movers(params: WaveParams, problem: CalibrationProblem, config: Calib
     likely = [tried[i] for i in np.argsort(-gains.mean(1))[:CLOSELY] if gains[i].mean() > 0]
     now, gone = score([params])[0], list[int]()
     closely = (now - score([of_air(params, one) for one in likely])).mean(1) if likely else np.zeros(0)
+    of_one = config.spurious_n_sigma + 0.5  # for a single body: more standard errors than for a pass, since bodies are many
     least = 1e-3  # minimum gain (natural logarithm of the decorrelation) for the removal of a body
     for one in np.array(likely, int)[np.argsort(-closely)].tolist():
         without = of_air(params, one)
         scores = score([without])[0]
         gain = now - scores
-        if gain.mean() > least and surely_better(gain, tx, SURE_OF_ONE) and len(gone) + 1 < len(first):
+        if gain.mean() > least and surely_better(gain, tx, of_one) and len(gone) + 1 < len(first):
             params, now = without, scores
             gone.append(one)
     return np.sort(np.array(gone, int))
@@ -161,9 +159,6 @@ def _carried(params: WaveParams, field: Calibratable) -> WaveParams:
 
 FEWEST = 6
 """Minimum number of these transmitters; fewer are never significant."""
-SURE_OF_CLUTTER = 1.0
-"""n_sigma: standard errors over transmitters by which the gain must be significant (`surely_better`). It is low, since a grid
-that is not needed makes other spectra fit worse, and does no harm otherwise."""
 PARTS = 4
 """Parts of the fit: after the first one, a grid with which other spectra fit worse is given up."""
 
@@ -213,7 +208,7 @@ def search_clutter(
                 break
     gains = before - after
     least_clutter = 2e-4  # minimum reduction of the mean absolute error; spectra are at most 1
-    taken = bool(gains.mean() > least_clutter) and surely_better(gains, held_out.tx_index(), SURE_OF_CLUTTER)
+    taken = bool(gains.mean() > least_clutter) and surely_better(gains, held_out.tx_index(), config.absorption_n_sigma)
     report = ClutterReport(float(before.mean()), float(after.mean()), taken)
     return (others, fuller, report) if taken else (params, problem, report)
 

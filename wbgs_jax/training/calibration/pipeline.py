@@ -34,9 +34,6 @@ from wbgs_jax.training.calibration.objective import CalibrationProblem, Scores, 
 from wbgs_jax.training.calibration.obstacles import search_absent, search_clutter
 from wbgs_jax.training.hooks import Context, Edit, Hook, Say
 
-SURE = 3.0
-"""n_sigma: standard errors over transmitters by which a gain must be significant (`surely_better`)."""
-
 
 @dataclass(frozen=True)
 class Idealisation:
@@ -64,7 +61,7 @@ def search_idealisations(
         if name == "thick":
             natural, _ = search_materials(natural, problem, count, once)
         before, after = score([params, natural])
-        dropped = surely_better(before - after, tx_index, SURE)
+        dropped = surely_better(before - after, tx_index, config.propagation_n_sigma)
         found[name] = Idealisation(float(before.mean()), float(after.mean()), dropped)
         params = natural if dropped else params
     return params, found
@@ -204,7 +201,7 @@ class Calibration(Hook):
         count = self.config.array_gain_spectra
         if problem.data.snapshots is None or not count or np.ptp(problem.tx_index(count)) == 0:
             return problem.field
-        field, found = search_tuning(params, problem, count)
+        field, found = search_tuning(params, problem, self.config)
         report["tuning"] = [*report.get("tuning", []), dataclasses.asdict(found)]
         return field
 
