@@ -112,7 +112,7 @@ class CalibrationConfig:
     """Training spectra up to a frequency, used for thicknesses that the scene does not specify ..."""
     thickness_glance: int = 48
     """... and the first of them, used to narrow down the candidate slabs."""
-    thickness_n_sigma: float = 2.0
+    thickness_n_sigma: float = setting(2.0, before=2.0)
     """Standard errors by which found thicknesses must fit better to be kept."""
     n_sigma: float = 2.0
     """Standard errors by which learned properties must fit better than every listed material to be kept."""
@@ -126,15 +126,15 @@ class CalibrationConfig:
     """Training spectra of low frequencies used to find spurious bodies of the mesh; 0 disables this ..."""
     spurious_glance: int = 96
     """... and the first of them, used to narrow down the candidate bodies."""
-    spurious_n_sigma: float = 2.0
+    spurious_n_sigma: float = setting(2.0, before=2.0)
     """Standard errors by which spectra must fit better without the bodies found in a pass for these to be removed."""
     propagation_spectra: int = 96
     """Training spectra used for the propagation options, such as effects that ray tracers leave out."""
-    propagation_n_sigma: float = 3.0
+    propagation_n_sigma: float = setting(3.0, before=3.0)
     """Standard errors by which a propagation option must fit better as in reality to be set so."""
     array_gain_spectra: int = 320
     """Training spectra used to calibrate the array gains; 0 disables this."""
-    array_gain_n_sigma: float = 3.0
+    array_gain_n_sigma: float = setting(3.0, before=3.0)
     """Standard errors by which array gains must fit better to be used."""
     geometry: bool = True
     """Whether surfaces of an inaccurate mesh are displaced."""
@@ -150,7 +150,7 @@ class CalibrationConfig:
     """Prior standard deviation of the displacement of surfaces, metres."""
     geometry_spectra: int = 64
     """Training spectra used to name materials between alignment steps."""
-    geometry_n_sigma: float = 2.0
+    geometry_n_sigma: float = setting(2.0, before=2.0)
     """Standard errors by which an aligned mesh must fit better to be kept; low, since the mesh has already been found to be
     inaccurate."""
     position_std_spectra: int = 96
@@ -159,7 +159,7 @@ class CalibrationConfig:
     """Training spectra used to decide whether an absorption grid fitted to the others is kept; 0 disables the grid."""
     absorption_steps: int = 800
     """Steps of the fit of the absorption grid."""
-    absorption_n_sigma: float = 1.0
+    absorption_n_sigma: float = setting(1.0, before=1.0)
     """Standard errors by which an absorption grid must fit better to be kept. It is low, since a grid that is not needed makes
     other spectra fit worse, and does no harm otherwise."""
 
