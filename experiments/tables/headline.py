@@ -48,7 +48,7 @@ NOTE = (
 CURVE_NOTE = (
     "**Gain against spectra seen**: WRF-GS starts anew at every frequency and needs more samples than one model for all of"
     " them. Scene {scene}, 8,000, 40,000 and 80,000 spectra; with 80,000 a model of WRF-GS sees as many at its frequency as the"
-    " wideband field with 8,000 at all of them. Gain: of the wideband field over WRF-GS, a model a frequency."
+    " wideband field with 8,000 at all of them."
 )
 UNSEEN_NOTE = (
     "**Unseen frequencies**: half of the 21 frequencies of scene 1 in training (combination D) against all of them. Where a"

@@ -51,36 +51,33 @@ def joined(parts: list[str], modules: tuple, results: Results, images: Path) -> 
 
 INTRODUCTION = """This page shows how well the fields predict spectra at transmitter positions, or frequencies, that were not
 used in training. It repeats the tables and figures of [*Wideband RF Radiance Field Modeling Using Frequency-embedded 3D
-Gaussian Splatting*](https://arxiv.org/abs/2505.20714) on [this repository's data](dataset.md); tables by scene and frequency
-stand on [a second page](results_tables{suffix}.md). Scores are median SSIM (scikit-image, 7 x 7 window). **In parentheses:
-the paper's value.** The paper's scenes are not published and the data here are others: compare orders and ratios, not single
-values.
+Gaussian Splatting*](https://arxiv.org/abs/2505.20714) on [this repository's data](dataset.md); [a second
+page](results_tables{suffix}.md) has the tables by scene and frequency. Scores are median SSIM (scikit-image, 7 x 7 window).
+**In parentheses: the paper's value.** The paper's scenes are not published: compare orders and ratios, not single values.
 
-* **wideband (ours)**: the paper's field with this project's inputs and projection, which gain more than anything else
-  ([decisions](decisions.md)); one model for all frequencies of a scene.
-* **WRF-GS**: the paper's comparison, a splatting field without frequency; *one model for every frequency*, all of which
-  together see as many spectra as ours. Rebuilt here with the same inputs as ours; not its authors' code
-  ([baselines](baselines.md)).
-* **WRF-GS, pooled**: our field without its frequency inputs, one model for all frequencies.
-* **5x samples**: trained on five times the usual number of spectra.
-* **coherent (ours)**: the [coherent field](wave.md), one model for all frequencies. It has more information than the others:
-  complex snapshots in training, the exact mesh and the walls' thickness, a list that contains the true materials, and the
-  physics that made the data. Its rows in tables 1 and 2 and figures 7 and 8 predate its learned uncertainty of surface
-  positions.
-* **NeRF2-style**: a volume marched along rays, with the frequency as an input; rebuilt here too.
-* **Untrained predictors** and the **phase-blind ceiling**, the mean spectrum over random phases of all true paths, about the
-  best possible without phases: see the [dataset card](dataset.md#ceilings). The ceiling was measured on 50 transmitters of
-  each scene.
-* **Truth against itself**: 40 transmitters of each scene, traced again with three times the rays. Scores above this level
-  cannot be distinguished.
+| name | what it is |
+| --- | --- |
+| wideband (ours) | the paper's field with this project's inputs and projection, which gain more than anything else \
+([decisions](decisions.md)); one model for all frequencies of a scene |
+| WRF-GS | the paper's comparison, a splatting field without frequency, one model for every frequency, all of which together \
+see as many spectra as ours; rebuilt here with the same inputs, not its authors' code ([baselines](baselines.md)) |
+| WRF-GS, pooled | our field without its frequency inputs, one model for all frequencies |
+| 5x samples | trained on five times the usual number of spectra |
+| coherent (ours) | the [coherent field](wave.md), one model for all frequencies. It has more information than the others: \
+complex snapshots, the exact mesh and the walls' thickness, a list that contains the true materials, and the physics that made \
+the data. Its rows in tables 1 and 2 and figures 7 and 8 predate its learned uncertainty of surface positions |
+| NeRF2-style | a volume marched along rays, with the frequency as an input; rebuilt here too |
+| untrained predictors, phase-blind ceiling | [dataset card](dataset.md#ceilings); the ceiling was measured on 50 transmitters \
+of each scene |
+| truth against itself | 40 transmitters of each scene, traced again with three times the rays; scores above this level cannot \
+be distinguished |
 
-Effort (profile `{name}`): {effort}.
-
-Intervals (95 %) are bootstrapped over transmitters, because spectra of one transmitter are no independent samples, and over
-seeds. Intervals and p-values treat neighbouring transmitters as independent, which they are not quite. The value of several
-seeds is their median. Unless a table names an exception, all models of a scene have the same training and test transmitters.
-Optimisers, rates, layers and loss were chosen on a validation part of the training transmitters; inputs and octaves are
-older, chosen on held-out transmitters of scenes 1 and 4. [How the experiments are run](experiments.md)."""
+* **Effort** (profile `{name}`): {effort}. [How the experiments are run](experiments.md).
+* **Intervals** (95 %) are bootstrapped over transmitters and seeds. Intervals and p-values treat neighbouring transmitters as
+  independent, which they are not quite. The value of several seeds is their median.
+* **Split**: unless a table names an exception, all models of a scene have the same training and test transmitters.
+* **Choices**: optimisers, rates, layers and loss were chosen on a validation part of the training transmitters; inputs and
+  octaves are older, chosen on held-out transmitters of scenes 1 and 4."""
 
 LONG_INTRODUCTION = """Reference tables of the [results](results.md), where models, scores and intervals are defined."""
 
