@@ -179,6 +179,8 @@ def test_an_array_out_of_tune_is_so_in_every_quantity(asked, rng):
     found = predict_gains(own.trained, own.receiver)
     np.testing.assert_allclose(found, gains, rtol=1e-5)
     a, _ = cir_of_paths(predict_paths(own.trained, own.receiver, TX, GHZ[0]), own.receiver, GHZ[0], found)
+    alone = predict_paths(own.trained, own.receiver, TX[0], GHZ[0])
+    assert alone.length.shape == predict_paths(own.trained, own.receiver, TX, GHZ[0]).length.shape, "one position is one row"
     np.testing.assert_allclose(a[0, 0, :, 0, 0, :, 0].sum(-1), expected, **near)
     elements = jnp.asarray(own.receiver.element_positions)
     strongest = np.abs(np.asarray(steering_vector(elements, jnp.float32(pas_directions()))).conj() @ expected).max()

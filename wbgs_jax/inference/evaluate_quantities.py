@@ -397,16 +397,14 @@ EVALUATE: dict[str, Callable[[LoadedField, np.ndarray, np.ndarray], Answer]] = {
 """Functions of `quantities.QUANTITIES` by name: (field, tx_positions (tx, 3), frequencies_hz (freq,)) -> `Answer`."""
 
 
-def predict_paths(
-    trained: TrainedField, receiver: Receiver, tx_positions: Float[np.ndarray, "tx 3"], frequency_hz: float
-) -> Paths:
+def predict_paths(trained: TrainedField, receiver: Receiver, tx_positions: Any, frequency_hz: Any) -> Paths:
     """Returns the paths from transmitters at one frequency, as NumPy arrays with a leading axis of transmitters.
 
     Args:
         trained: a field that predicts paths.
         receiver: receiver; for one that is not in the training data, call `at_receiver` first.
-        tx_positions: (tx, 3), world frame, metres.
-        frequency_hz: of the carrier.
+        tx_positions: (tx, 3), or (3,) for one transmitter, world frame, metres.
+        frequency_hz: of the carrier; one or (tx,).
 
     Returns:
         `wbgs_jax.Paths` with arrays (tx, k, ...), whose methods `cir`, `cfr` and `taps` are the channel.
@@ -420,7 +418,7 @@ def predict_paths(
     """
     check_quantity("paths", trained.field)
     plan = trained.field.plan(trained.params, receiver)
-    query = make_query(np.asarray(tx_positions), np.full(len(tx_positions), frequency_hz))
+    query = make_query(tx_positions, frequency_hz)
     found: Paths = map_blocks(lambda block: paths_of(trained.field, trained.params, plan, block), query, BLOCK)
     return found
 
