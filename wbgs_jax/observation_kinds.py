@@ -157,7 +157,8 @@ def _fault_of_snapshots(values: np.ndarray) -> str:
 
 
 def _fault_of_images(values: np.ndarray) -> str:
-    return "spectra of at most 1 (multiply them by 255)" if values.max(initial=0) == 1 else ""
+    highest = values.max(initial=0)
+    return "only 0" if not highest else "spectra of at most 1 (multiply them by 255)" if highest == 1 else ""
 
 
 def _fault_of_powers(values: np.ndarray) -> str:
@@ -172,7 +173,15 @@ def _fault_of_powers(values: np.ndarray) -> str:
 
 register_kind(
     # 255 times a spectrum whose maximum is 1
-    Kind("pas", "spectra", np.uint8, PAS_SHAPE, to_spectra=_spectra_of_images, fault=_fault_of_images)
+    Kind(
+        "pas",
+        "spectra",
+        np.uint8,
+        PAS_SHAPE,
+        to_spectra=_spectra_of_images,
+        measured=lambda values: np.asarray(values.any((-2, -1))),  # without a maximum there is no spectrum
+        fault=_fault_of_images,
+    )
 )
 register_kind(
     Kind(

@@ -469,3 +469,26 @@ def test_files_in_other_spellings(folder, recwarn):
         UserWarning, match=r"room\.glb is not read; if .*, convert it: wbgs-jax convert room\.glb --out room\.npz"
     ):
         load_layout(folder)
+
+
+def test_spectra_that_are_not_scaled_to_their_maximum(folder):
+    bright = load_layout(folder, convention="zenith").observations["pas"]
+    for path in (folder / "spectrum").iterdir():
+        Image.fromarray(np.asarray(Image.open(path)) // 4).save(path)
+    with pytest.warns(UserWarning, match="maximum of 6 of 6 spectra is below 230 of 255; each spectrum is scaled"):
+        scaled = load_layout(folder, convention="zenith").observations["pas"]
+    np.testing.assert_allclose(scaled.astype(float), bright, atol=6)
+    assert (scaled.max((1, 2)) == 255).all()
+
+
+def test_a_black_image_is_no_spectrum(folder):
+    Image.fromarray(np.zeros((90, 360), np.uint8)).save(folder / "spectrum" / "00003.png")
+    with pytest.raises(UserError, match=r"image 00003 of .*spectrum is black; remove images without spectra \(1 of 6\)"):
+        load_layout(folder, convention="zenith")
+
+
+def test_a_transmitter_at_the_receiver_is_refused(folder):
+    rows = (folder / "tx_pos.csv").read_text().splitlines()
+    (folder / "tx_pos.csv").write_text("\n".join([*rows[:2], "2,1,0.5", *rows[3:]]))
+    with pytest.raises(UserError, match=r"den: the transmitter at .* is at its receiver"):
+        load_layout(folder, convention="zenith")

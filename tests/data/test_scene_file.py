@@ -210,6 +210,15 @@ def test_what_a_receiver_does_not_hear_is_no_link(kind, nothing, tmp_path):
     assert dataset.receiver_index[dataset.tx_index == 0].tolist() == [0, 0, 0, 1, 1, 1, 2, 2]
 
 
+def test_an_empty_spectrum_is_no_link_and_a_dark_one_is_scaled(tmp_path):
+    scene = tiny_scene(4, n_rx=3, kind="pas")
+    scene.pas[..., 0, 0], scene.pas[1], scene.pas[0, 2, 1] = 255, 0, scene.pas[0, 2, 1] // 4 + 1
+    save_scene(tmp_path / "s.npz", scene)
+    with pytest.warns(UserWarning, match="maximum of 1 of 27 spectra is below 230 of 255"):
+        dataset = load_dataset(tmp_path / "s.npz")
+    assert len(dataset) == 27 and (dataset.observations["pas"].max((1, 2)) == 255).all()
+
+
 def test_a_place_on_both_sides_of_the_split_is_noted(tmp_path):
     scene = tiny_scene(4)
     scene.tx_positions[3], scene.split[:] = scene.tx_positions[0], [0, 0, 2, 1]

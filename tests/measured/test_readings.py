@@ -9,7 +9,7 @@ from builders.flats import HEIGHT, RECEIVERS, folder, places, powers, write_tabl
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.rssi_folder import Readings, attribution, cell_means, load_readings
-from wbgs_jax.data.tables import match_columns, not_received, tokens
+from wbgs_jax.data.tables import match_columns, not_received, note_of_powers, tokens
 from wbgs_jax.power_map.model import MAX_PLACES
 from wbgs_jax.power_map.survey import load_survey
 
@@ -498,3 +498,27 @@ def test_small_inputs_that_were_read_wrongly():
     for name in ("readings/milliwatt", "degrees"):
         with pytest.raises(UserError):
             load_readings(CASES / name, HEIGHT)
+
+
+def test_powers_that_contradict_the_places_of_receivers_are_noted(rng):
+    receivers = np.array([[1.0, 5, 2], [18, 5, 2], [10, 1, 2]])
+    around = rng.uniform([0, 0, 1.3], [20, 6, 1.3], (120, 3))
+    dbm = -45 - 20 * np.log10(np.linalg.norm(around[:, None] - receivers, axis=-1)) + rng.normal(0, 2, (120, 3))
+    silent, constant = dbm.copy(), dbm.copy()
+    silent[:, 1], constant[:, 1] = np.nan, -30
+    few = dbm.copy()
+    few[10:, 0] = np.nan
+    for measured, own, words in (
+        (dbm, receivers, None),
+        (few, receivers, None),
+        (dbm, receivers[:1].repeat(3, 0), None),
+        (dbm[:, [1, 0, 2]], receivers, "the powers of receiver 1 fit the place of receiver 2 clearly better"),
+        (dbm, receivers[:, [1, 0, 2]], "powers fit clearly better if x and y of the receivers are exchanged"),
+        (-100 - dbm, receivers, "powers rise with the distance from their receivers"),
+        (silent, receivers, "receiver 2 has received nothing"),
+        (constant, receivers, "all 120 powers of receiver 2 are -30 dBm"),
+    ):
+        with warnings.catch_warnings(record=True) as notes:
+            warnings.simplefilter("always")
+            note_of_powers("hall", around, measured, own)
+        assert [str(note.message)[: len(words or "") + 6] for note in notes] == ([f"hall: {words}"] if words else [])

@@ -46,7 +46,7 @@ from wbgs_jax.data.conventions import (
     unrelated,
 )
 from wbgs_jax.data.dataset import Dataset, group_places, group_transmitters, note_shared_transmitters, tx_disjoint_split
-from wbgs_jax.data.load import check_surroundings, materials_of, scene_dataset
+from wbgs_jax.data.load import check_surroundings, materials_of, scaled_spectra, scene_dataset
 from wbgs_jax.data.scene_file import Room, SceneFile, check_mesh, load_room
 from wbgs_jax.mesh.bodies import share_in_box
 from wbgs_jax.mesh.ply import read_ply, write_ply
@@ -179,6 +179,7 @@ def load_layout(
         raise UserError(f"{folder} is not a folder; give one that contains {SPECTRA}/, {POSITIONS} and {GATEWAY}")
     images = _read_images(folder / SPECTRA)
     positions = _read_positions(folder / POSITIONS, len(images))
+    images = _scaled(images, folder)
     gateway = read_gateway(folder / GATEWAY)
     tx_index = group_transmitters(positions)
     room = _read_room(folder)
@@ -329,6 +330,16 @@ def _read_images(folder: Path) -> UInt8[np.ndarray, "n 90 360"]:
     if fault := KINDS["pas"].fault(images):
         raise UserError(f"{folder} contains {fault}; write its images again")
     return images
+
+
+def _scaled(images: UInt8[np.ndarray, "n 90 360"], folder: Path) -> UInt8[np.ndarray, "n 90 360"]:
+    """Returns spectra scaled to their maximum; a black image is a `UserError`."""
+    if (black := images.max((1, 2)) == 0).any():
+        raise UserError(
+            f"image {1 + black.argmax():05d} of {folder / SPECTRA} is black; remove images without spectra ({black.sum()} of "
+            f"{len(images)}) with their rows of {POSITIONS} and {FREQUENCIES}, and number the others from 1"
+        )
+    return scaled_spectra(images, str(folder))
 
 
 def _read_image(path: Path) -> UInt8[np.ndarray, "90 360"]:

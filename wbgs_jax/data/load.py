@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, UInt8
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.conventions import ConventionName
@@ -233,7 +233,10 @@ def scene_dataset(scene: SceneFile) -> Dataset:
         train=parts["train"],
         validation=parts["validation"],
         test=parts["test"],
-        observations={name: values[links] for name, values in scene.observations.items()},
+        observations={
+            name: scaled_spectra(values[links], scene.name) if name == "pas" else values[links]
+            for name, values in scene.observations.items()
+        },
         vertices=scene.vertices,
         faces=scene.faces,
         face_part=scene.face_part,
@@ -244,14 +247,39 @@ def scene_dataset(scene: SceneFile) -> Dataset:
     return check_surroundings(dataset)
 
 
+def scaled_spectra(images: UInt8[np.ndarray, "n 90 360"], name: str) -> UInt8[np.ndarray, "n 90 360"]:
+    """Returns spectra, each scaled to its own maximum of 255 if some are clearly darker; a warning reports this.
+
+    Args:
+        images: spectra times 255.
+        name: of the data, for the message.
+    """
+    brightest = images.max((1, 2))
+    dark = 230  # maximum of an image below which it is not scaled to 255, whatever programs have rounded or resampled
+    if not (few := brightest < dark).any():
+        return images
+    warnings.warn(
+        f"{name}: the maximum of {few.sum()} of {len(images)} spectra is below {dark} of 255; each spectrum is scaled to its "
+        "own maximum",
+        stacklevel=4,
+    )
+    scaled = np.round(images * (255.0 / np.maximum(brightest, 1))[:, None, None].astype(np.float32))
+    return scaled.astype(np.uint8)
+
+
 def check_surroundings(dataset: Dataset) -> Dataset:
     """Returns the dataset, after a comparison of its surfaces with its transmitters and receivers; a warning reports
     transmitters, or receivers, most of which are beside the surfaces.
 
     Raises:
-        UserError: all antennas are farther from the box of the surfaces than its longest side, or most transmitters or most
-            receivers much farther, as with another unit or frame.
+        UserError: a transmitter is at its receiver; or all antennas are farther from the box of the surfaces than its longest
+            side, or most transmitters or most receivers much farther, as with another unit or frame.
     """
+    links = np.linalg.norm(dataset.tx_positions - np.asarray(dataset.receivers.position)[dataset.receiver_index], axis=1)
+    touching = 1e-3  # metres: no two antennas are at one point, where there is no direction
+    if (links < touching).any():
+        place = dataset.tx_positions[links.argmin()].tolist()
+        raise UserError(f"{dataset.name}: the transmitter at {place} is at its receiver; correct its position, or remove it")
     if not len(dataset.faces):
         return dataset
     used = dataset.vertices[dataset.faces].reshape(-1, 3).astype(np.float64)

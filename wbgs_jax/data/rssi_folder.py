@@ -43,6 +43,7 @@ from wbgs_jax.data.tables import (
     found,
     match_columns,
     not_received,
+    note_of_powers,
     numbers,
     read_table,
 )
@@ -285,6 +286,7 @@ def _checked(readings: Readings, folder: Path) -> Readings:
     check_frame(f"{folder}: places", readings.places, readings.receivers)
     if np.isnan(readings.powers).all():
         raise UserError(f"{folder}: nothing was received anywhere")
+    note_of_powers(str(folder), readings.places, readings.powers, readings.receivers)
     return readings
 
 

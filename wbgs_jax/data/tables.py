@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.optimize import linear_sum_assignment
 
 from wbgs_jax._util.cli import parse_number
 from wbgs_jax._util.errors import UserError
@@ -310,4 +311,52 @@ def check_frame(what: str, places: Float[np.ndarray, "n 3"], receivers: Float[np
         raise UserError(
             f"{what} all lie within {extent:.2g}, {nearest:.3g} m from the nearest receiver: degrees of longitude and "
             "latitude; project them to metres (for example UTM), relative to the origin of the receivers"
+        )
+
+
+def note_of_powers(
+    what: str, places: Float[np.ndarray, "n 3"], powers: Float[np.ndarray, "n r"], receivers: Float[np.ndarray, "r 3"]
+) -> None:
+    """Warns of powers (dBm) that rise with the distance from their receivers, of those that fit the places of other receivers
+    or exchanged coordinates clearly better, and of receivers without powers, or with only one value."""
+    fewest = 20  # readings of a receiver
+    for number, own in enumerate(powers.T, 1):
+        received = own[~np.isnan(own)]
+        if not len(received):
+            warnings.warn(f"{what}: receiver {number} has received nothing; its map is that of the others", stacklevel=2)
+        elif len(received) >= fewest and np.ptp(received) == 0:
+            warnings.warn(
+                f"{what}: all {len(received)} powers of receiver {number} are {received[0]:g} dBm; check whether they were "
+                "measured",
+                stacklevel=2,
+            )
+    varied = [k for k, own in enumerate(powers.T) if np.isfinite(own).sum() >= fewest and np.nanstd(own) > 0]
+    if not varied:
+        return
+
+    def fit(points: Float[np.ndarray, "r 3"]) -> Float[np.ndarray, "k k"]:
+        """Returns the correlations of powers with falling logarithms of distances, by columns of powers and by receivers."""
+        near = 0.1  # metres, within which the law of the distance does not hold
+        closeness = -np.log(np.maximum(np.linalg.norm(places[:, None] - points[varied], axis=-1), near))
+        both = [np.column_stack([powers[:, k], closeness])[~np.isnan(powers[:, k])] for k in varied]
+        with np.errstate(invalid="ignore"):  # of places at one distance
+            return np.nan_to_num([np.corrcoef(own, rowvar=False)[0, 1:] for own in both])
+
+    clear, sure = 0.4, 0.6  # gain in the mean correlation, and correlation, of what is right
+    table = fit(receivers)
+    own = float(np.diag(table).mean())
+    order = linear_sum_assignment(-table)[1]
+    swapped = float(np.diag(fit(receivers[:, [1, 0, 2]])).mean())
+    assigned = float(table[np.arange(len(order)), order].mean())
+    if max(assigned, swapped) > max(sure, own + clear):
+        moved = int(np.argmax(order != np.arange(len(order))))
+        other = f"powers of receiver {varied[moved] + 1} fit the place of receiver {varied[order[moved]] + 1}"
+        axes = "powers fit clearly better if x and y of the receivers are exchanged; give both in one frame"
+        columns = f"the {other} clearly better; check which column belongs to which receiver"
+        warnings.warn(f"{what}: {columns if assigned >= swapped else axes}", stacklevel=2)
+    elif own < -0.5 * clear:
+        warnings.warn(
+            f"{what}: powers rise with the distance from their receivers (correlation {own:.2f}); check their sign, and the "
+            "positions of the receivers",
+            stacklevel=2,
         )
