@@ -5,6 +5,7 @@ import json
 import shutil
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.commands import assert_error_for_people, call, in_a_process
@@ -18,6 +19,8 @@ from wbgs_jax.commands import train as train_command
 from wbgs_jax.data.image_folder import export_layout
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.evaluation.score import watch
+from wbgs_jax.fields import get_field
+from wbgs_jax.inference.kriging import Mixture
 from wbgs_jax.training import curves
 from wbgs_jax.training.checkpoint import checkpoint_steps
 from wbgs_jax.training.loop import Run
@@ -383,3 +386,36 @@ def test_an_unknown_scene_in_a_process_of_its_own(tmp_path):
         in_a_process("wbgs_jax.commands.train", "--scene", "no-such-scene", "--out", tmp_path / "run"), "no scene"
     )
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_was_found_wrong_with_the_mesh_is_printed():
+    settings = get_field("wave").presets["cpu"]
+    off = dataclasses.replace(settings, calibration=dataclasses.replace(settings.calibration, geometry=False))
+
+    def lines(settings=settings, **report):
+        return train_command.mesh_lines([{"step": 10, "loss": 1.0}, {"step": 0, **report}], settings)
+
+    moved = {"kept": True, "largest_mm": 12.34, "receiver_mm": 1.0}
+    assert lines() == [] and lines(doubt={"spread_mm": 0.3}) == [] and lines(off, doubt={"spread_mm": 0.3}) == []
+    (line,) = lines(off, doubt={"spread_mm": 10.0})
+    assert "off by about 10 mm; none was moved: --calibration.geometry" in line
+    (line,) = lines(doubt={"spread_mm": 10.0}, geometry=moved)
+    assert "bodies moved by up to 12 mm, the receiver by 1 mm" in line
+    (line,) = lines(doubt={"spread_mm": 10.0}, geometry=moved | {"kept": False})
+    assert "no motion fits significantly better" in line
+    (line,) = lines(doubt={"spread_mm": 0.1}, absent={"centres": [[0.0, 1.0, 2.0]]})
+    assert line.startswith("mesh: 1 body left out")
+
+
+def test_scores_name_the_share_of_measured_spectra():
+    one = jnp.zeros(3)
+    few = Mixture(
+        one, jnp.zeros(4), jnp.zeros((0, 3)), jnp.float32(0), jnp.zeros((5, 3)), jnp.full(5, 1e9),
+        jnp.zeros((5, 90, 360), jnp.uint8), jnp.zeros((90, 360)), jnp.float32(1), jnp.float32(0),
+        jnp.array([0.0, 1.0, -1.0, 1.0]), jnp.zeros((5, 2)), jnp.array([-30.0, 0.0]),
+    )  # fmt: skip
+    assert eval_command.correction_lines(None) == []
+    (line,) = eval_command.correction_lines(few)
+    assert "the field (weight 0.00) with simple methods on 5 measured spectra" in line
+    (line,) = eval_command.correction_lines(dataclasses.replace(few, field=jnp.array([0.0, 1.0])))
+    assert "(weight 0.27 to 0.73)" in line

@@ -296,7 +296,7 @@ def test_a_scene_that_is_none_is_not_written(tmp_path, scene, key, value, messag
 @pytest.mark.parametrize(
     ("kind", "value", "message"),
     [
-        ("pas", np.ones((4, 1, 3, 90, 360), np.float32), "pas must be a 5-D uint8"),
+        ("pas", np.ones((4, 1, 3, 90, 360), np.float32), "pas must be a 5-D uint8 array, not 5-D float32"),
         ("pas", np.ones((4, 1, 3, 360, 90), np.uint8), "pas has shape"),
         ("pas", np.ones((4, 2, 3, 90, 360), np.uint8), "element_positions has shape"),
         ("pas", np.ones((4, 1, 3, 90, 360), np.uint8), r"pas contains spectra of at most 1 \(multiply them by 255\)"),

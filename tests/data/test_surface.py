@@ -142,6 +142,8 @@ def test_points_are_no_mesh(vertices):
     with pytest.raises(UserError, match=r"room has no mesh.*give a scene with a mesh") as error:
         make_mesh(room(with_faces=False, with_vertices=vertices))
     assert "\n" not in str(error.value)
+    what, _, advice = str(error.value).partition("; ")  # the hybrid field passes on the first part alone
+    assert ("only points" in what) == vertices and "choose a field" in advice
 
 
 def test_too_few_points_and_unknown_samplings_are_refused():

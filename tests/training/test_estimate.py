@@ -37,6 +37,23 @@ def test_programs_of_a_training_shorten_the_next(monkeypatch, cache):
     assert expected_seconds(field, "smoke") == sum(known)
 
 
+def test_a_remaining_time_that_has_run_out_is_not_shown(monkeypatch):
+    """Programs that are compiled between two steps take longer than the steps that were timed."""
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    shown = progress.TrainingProgress(100, shown=False)
+    for step in (20, 40, 60):
+        now[0] += 10
+        shown.update({"step": step, "loss": 0.5})
+    assert shown._line() == "step 60/100  loss 0.5  2.0 steps/s  20 s left (30 s)"
+    now[0] += 15
+    assert "  5 s left (45 s)" in shown._line()
+    now[0] += 30
+    assert "left" not in shown._line() and shown._line().endswith("2.0 steps/s (75 s)")
+    shown.stage("validation: weights")
+    assert shown._line() == "validation: weights (75 s)"
+
+
 def test_the_probe_takes_a_moment():
     assert 0 < progress._probe() < 5
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from builders.commands import assert_error_for_people, call
 
-from wbgs_jax._util.cli import option_value, parse_vector, point_words, run_command, say
+from wbgs_jax._util.cli import counted, option_value, parse_vector, point_words, run_command, say
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.training.progress import Interrupted
 from wbgs_jax.types import LARGEST_COORDINATE_M
@@ -87,3 +87,8 @@ def test_what_the_operating_system_says_of_a_file_is_one_line():
 def test_a_point_has_no_rounding_errors():
     """The middle of a line from -0.1 to 0.2 is off zero by 1e-17."""
     assert point_words(np.array([np.linspace(-0.1, 0.2, 4)[1], -0.0, 0.1234567])) == "(0, 0, 0.123457) m"
+
+
+def test_counts_have_a_singular():
+    assert [counted(n, "transmitter") for n in (0, 1, 2)] == ["0 transmitters", "1 transmitter", "2 transmitters"]
+    assert [counted(n, "frequency", "frequencies") for n in (1, 2)] == ["1 frequency", "2 frequencies"]

@@ -53,6 +53,11 @@ def say(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
+def counted(count: int, one: str, more: str = "") -> str:
+    """Returns a number with its noun: "1 transmitter", "2 transmitters"; `more` is an irregular plural."""
+    return f"{count} {one if count == 1 else more or one + 's'}"
+
+
 def option_value(arguments: Sequence[str], name: str, default: str) -> str:
     """Returns the value of an option on the command line, or the default; the last occurrence counts."""
     value = default

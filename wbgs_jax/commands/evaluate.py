@@ -15,11 +15,13 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import tyro
 from rich.console import Console
+from scipy.special import expit
 
 from wbgs_jax import plotting
-from wbgs_jax._util.cli import run_command
+from wbgs_jax._util.cli import counted, run_command
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import check_writable, write_json
@@ -27,6 +29,8 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.evaluation.report import closing_lines, provenance, result_path, table, with_part
 from wbgs_jax.evaluation.score import Part, evaluate, held_out
 from wbgs_jax.fields.base import outputs_of
+from wbgs_jax.inference.kriging import FILE as NEIGHBOURS
+from wbgs_jax.inference.kriging import Beside, Mixture
 from wbgs_jax.inference.predictor import BLOCK
 from wbgs_jax.inference.trained_field import TrainedField, at_receivers
 from wbgs_jax.training import curves
@@ -87,7 +91,7 @@ def main(arguments: list[str] | None = None) -> None:
         print(json.dumps(report, allow_nan=False))
         return
     Console(width=None if sys.stdout.isatty() else 140).print(table(report))
-    print("\n".join(closing_lines(report, BLOCK)))
+    print("\n".join([*correction_lines(trained.correction), *closing_lines(report, BLOCK)]))
     for line in next_lines(trained, dataset, command.run):
         console.print(line)
 
@@ -99,6 +103,20 @@ def for_receivers(trained: TrainedField, dataset: Dataset) -> TrainedField:
     except UserError as error:
         warnings.warn(f"scored as if {dataset.name} had the receivers of the training: {error}", stacklevel=2)
         return trained
+
+
+def correction_lines(correction: Beside) -> list[str]:
+    """Returns a line on how measured spectra contribute to the scored predictions; none if the field predicts alone."""
+    if correction is None:
+        return []
+    count = counted(len(correction.images), "measured spectrum", "measured spectra")
+    if not isinstance(correction, Mixture):
+        return [f"predictions are corrected by the nearest of {count} ({NEIGHBOURS})"]
+    mean, deviation, nearest, farthest = np.asarray(correction.log_distance)
+    logits = correction.field[0] + correction.field[1] * (np.array([nearest, farthest]) - mean) / deviation
+    low, high = np.sort(expit(np.asarray(logits)))
+    weight = f"{low:.2f}" if high - low < 0.005 else f"{low:.2f} to {high:.2f}"
+    return [f"predictions mix the field (weight {weight}) with simple methods on {count} ({NEIGHBOURS})"]
 
 
 def next_lines(trained: TrainedField, dataset: Dataset, run: Path) -> list[str]:

@@ -21,7 +21,7 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from wbgs_jax._util.cli import parse_positions, parse_vector, run_command, say
+from wbgs_jax._util.cli import counted, parse_positions, parse_vector, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import check_writable
@@ -99,7 +99,7 @@ class Command(TrainedFieldOptions):
     resume: bool = False
     """Continue the same command after an interruption."""
     picture: Path | None = None
-    """Draw 12 links or curves to this .png, .svg or .pdf file."""
+    """Draw them, at most 12 links or curves, to this .png, .svg or .pdf file."""
     export: Path | None = None
     """Write the field as a program to this .zip file."""
 
@@ -253,9 +253,10 @@ def answer(command: Command, queries: Queries) -> None:
         warn_of_intervals(np.isnan(values.reshape(len(values), -1)[:, 0]))
     for line in results_file.lines(command.what, answers, queries, field.source):
         say(line)
-    count = f"{len(queries)} queries"
+    count = counted(len(queries), "query", "queries")
     if not queries.paired:
-        count = f"{len(queries.tx_positions)} transmitters at {len(queries.frequencies_hz)} frequencies"
+        at = counted(len(queries.frequencies_hz), "frequency", "frequencies")
+        count = f"{counted(len(queries.tx_positions), 'transmitter')} at {at}"
     if command.out:
         replaced = ", replacing the previous file" if command.out.exists() else ""
         results_file.write(command.out, command.what, answers, queries, field.source)

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import jax
 import tyro
 
-from wbgs_jax._util.cli import option_value, run_command, say
+from wbgs_jax._util.cli import counted, option_value, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.declared_types import misfits, plain
 from wbgs_jax._util.devices import by_first, connect, is_first
@@ -32,6 +32,7 @@ from wbgs_jax.fields.base import check_config
 from wbgs_jax.inference.intervals import write_confidence
 from wbgs_jax.inference.kriging import write_neighbours
 from wbgs_jax.inference.trained_field import RunConfig, TrainedField
+from wbgs_jax.training import curves
 from wbgs_jax.training.batches import check_data, knows_no_paths, limited
 from wbgs_jax.training.checkpoint import checkpoint_steps
 from wbgs_jax.training.cross_validation import Training, is_few, learn_few
@@ -274,6 +275,8 @@ def _train(command: Command, settings: Settings) -> None:
         except KeyboardInterrupt:  # in the last epoch, after it, or for the second time
             raise Interrupted("stopped; run the same command with --resume to continue") from None
         by_first(lambda: write_manifest(folder, load_trained(folder)))
+    for line in mesh_lines(curves.read(folder / "metrics.jsonl"), settings):
+        tell(line)
     tell(summary(result, folder, time.monotonic() - begin))
     tell(f"next: wbgs-jax eval --run {shlex.quote(str(folder))}   (scores on held-out transmitters, and figures)")
 
@@ -309,7 +312,8 @@ def learn_beside(result: TrainResult, dataset: Dataset, config: RunConfig, folde
             state = text
             say(text)
 
-        with Pulse(lambda: state):
+        begin = time.monotonic()
+        with Pulse(lambda: f"{state} ({time.monotonic() - begin:.0f} s)"):
             few = learn_few(*trained, training, stage)
             write_neighbours(folder, few.mixture)
             say(few.line)
@@ -326,9 +330,32 @@ def learn_beside(result: TrainResult, dataset: Dataset, config: RunConfig, folde
         write_confidence(folder, *learn_confidence(*trained, learned.of_training))
 
 
+def mesh_lines(entries: list[dict[str, Any]], settings: Settings) -> list[str]:
+    """Returns lines on what the calibration found wrong with the mesh, and what it did; none for an accurate mesh.
+
+    Args:
+        entries: of `metrics.jsonl`.
+        settings: of the training.
+    """
+    report = next((entry for entry in entries if "doubt" in entry), {})
+    lines, where = [], "in metrics.jsonl"
+    if bodies := report.get("absent", {}).get("centres"):
+        lines.append(f"mesh: {counted(len(bodies), 'body', 'bodies')} left out, absent in the data (`absent` {where})")
+    off, geometry = report.get("doubt", {}).get("spread_mm", 0.0), report.get("geometry")
+    found = f"mesh: spectra fit best if surfaces are off by about {off:.2g} mm"
+    if geometry is not None and geometry["kept"]:
+        moved = f"bodies moved by up to {geometry['largest_mm']:.2g} mm, the receiver by {geometry['receiver_mm']:.2g} mm"
+        lines.append(f"{found}; {moved} (`geometry` {where})")
+    elif geometry is not None:
+        lines.append(f"{found}; none was moved, since no motion fits significantly better (`geometry` {where})")
+    elif (rule := settings.calibration) and not rule.geometry and off > 1e3 * rule.geometry_position_std:
+        lines.append(f"{found}; none was moved: --calibration.geometry (off in the smoke preset) looks for the motions")
+    return lines
+
+
 def summary(result: TrainResult, folder: Path, seconds: float) -> str:
     """Returns the last line of a training that took `seconds` of wall time since it was started or continued."""
-    sizes = ", ".join(f"{count} {name}" for name, count in result.sizes.items())
+    sizes = ", ".join(counted(count, name.removesuffix("s")) for name, count in result.sizes.items())
     return f"trained {result.steps} steps, {sizes}, {seconds:.0f} s in all: {folder}"
 
 

@@ -111,8 +111,9 @@ def make_mesh(dataset: Dataset) -> Mesh:
         UserError: there are only points, or no surfaces at all.
     """
     if not len(dataset.faces):
-        advice = "give a scene with a mesh or choose a field that does not need one"
-        raise UserError(f"{dataset.name} has no mesh, only points, but this field needs surfaces: {advice}")
+        what = "no mesh, only points" if len(dataset.vertices) else "no mesh"
+        advice = "give a scene with a mesh, or choose a field that does not need one (docs/which_field.md)"
+        raise UserError(f"{dataset.name} has {what}; this field needs surfaces: {advice}")
     one = np.zeros(len(dataset.faces), np.int32)
     materials = dataset.materials or Materials(one, ("",), np.zeros(1))
     return Mesh(

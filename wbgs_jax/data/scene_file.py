@@ -123,7 +123,8 @@ def _sizes(arrays: dict[str, np.ndarray], specs: dict[str, Spec]) -> dict[str, i
         value = arrays[key]
         phased = np.iscomplexobj(value) or not issubclass(dtype, np.complexfloating)  # real numbers would have phases of 0
         castable = phased and np.can_cast(value.dtype, dtype, "same_kind")
-        _demand(value.ndim == len(axes) and castable, f"{key} must be a {len(axes)}-D {dtype.__name__} array")
+        is_now = f"{value.ndim}-D {value.dtype.name}"
+        _demand(value.ndim == len(axes) and castable, f"{key} must be a {len(axes)}-D {dtype.__name__} array, not {is_now}")
         lengths = list(zip(axes, value.shape, strict=True))
         expected = tuple(sizes.get(axis, n) if isinstance(axis, str) else axis for axis, n in lengths)
         _demand(value.shape == expected, f"{key} has shape {value.shape}, expected {expected} to match the other arrays")

@@ -68,7 +68,8 @@ def make_power_predictor(trained: TrainedField, receiver: Receiver | None = None
         receiver: by default the first one of the training data.
 
     Returns:
-        The function; powers (b,), or () for one position.
+        The function; powers (b,) in decibels for positions (b, 3) in metres and frequencies in hertz, or () for one position.
+        The received power in dBm is the sum of this and the transmitted power in dBm.
 
     Raises:
         UserError: the field does not predict power, or was trained on spectra, which have no scale.

@@ -60,7 +60,9 @@ class TrainingProgress:
             disable=not (shown and console.is_terminal),
         )
         self.task = self.bar.add_task("train", total=total, completed=done, status="compiling ...")
-        self.pulse = Pulse(lambda: f"{self.state} ({time.monotonic() - self.begun:.0f} s)", shown)
+        self.ready: float | None = None
+        """When the last step is expected (`time.monotonic`); None before there is a rate."""
+        self.pulse = Pulse(self._line, shown)
 
     def __enter__(self) -> "TrainingProgress":
         self.bar.start()
@@ -71,9 +73,15 @@ class TrainingProgress:
         self.pulse.__exit__()
         self.bar.stop()
 
+    def _line(self) -> str:
+        """Returns the present state for a log, without a remaining time that has run out, as when a program is compiled."""
+        now = time.monotonic()
+        left = "" if self.ready is None or self.ready < now else f"  {self.ready - now:.0f} s left"
+        return f"{self.state}{left} ({now - self.begun:.0f} s)"
+
     def stage(self, what: str) -> None:
-        """Shows a stage of the work before the first step."""
-        self.state = what
+        """Shows a stage of the work before the first step or between two steps."""
+        self.state, self.ready = what, None
         self.bar.update(self.task, status=f"{what} ...")
         self.pulse.print()
 
@@ -91,8 +99,8 @@ class TrainingProgress:
         rate = (step - self.start_step) / elapsed if self.entries > 1 else None
         status = "  ".join([*figures, *([] if rate is None else [f"{rate:.1f} steps/s"])])
         self.bar.update(self.task, completed=step, status=status)
-        left = "" if rate is None else f"  {(self.total - step) / max(rate, 1e-9):.0f} s left"
-        self.state = f"step {step}/{self.total}  {status}{left}"
+        self.ready = None if rate is None else time.monotonic() + (self.total - step) / max(rate, 1e-9)
+        self.state = f"step {step}/{self.total}  {status}"
         if step >= self.total:
             self.pulse.print()
         self.entries += 1
