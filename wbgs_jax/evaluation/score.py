@@ -253,12 +253,19 @@ def evaluate(
         left = without_queried(trained.correction, dataset.query(index))
         trained = dataclasses.replace(trained, correction=left)
     reference = with_validation_trained(dataset) if tested else dataset
-    with ThreadPoolExecutor(1) as threads, CountProgress("predicted spectra", len(index), shown=shown) as progress:
+    with _Beside() as beside:
         calls = timed_calls(trained, dataset) if timed else {}
-        compiled = [threads.submit(call) for call in calls.values()]  # while the predictions are computed
-        predictions = observe(trained, dataset, index, progress.advance)
-        for one in compiled:
-            one.result()
+        compiled = [beside.submit(call) for call in calls.values()]
+        rivals = {name: beside.submit(score) for name, score in baseline_scores(dataset, index, reference).items()}
+        with CountProgress("predicted spectra", len(index), shown=shown) as progress:
+            predictions = observe(trained, dataset, index, progress.advance)
+            for call in compiled:
+                call.result()
+        scores: dict[str, Any] = {}
+        with CountProgress("scores of simple methods", len(rivals), shown=shown) as progress:
+            for name, rival in rivals.items():
+                scores[name] = rival.result()
+                progress.advance()
     report = {"scene": dataset.name, "field": trained.origin()["field"], "part": part}
     power_db = power_of(predictions, dataset)
     with Pulse(lambda: "scores of received power and of snapshots", shown):
@@ -270,9 +277,9 @@ def evaluate(
     if not dataset.has_spectra:
         return report | own | (power or {}) | time_queries(calls), np.asarray(predictions.pas)
     truth = np.asarray(dataset.pas(index))
-    spectra, ssim = score_spectra(np.asarray(predictions.pas), truth, dataset, index, reference, shown)
-    report |= spectra
-    with Pulse(lambda: "prediction intervals" + timed * ", time of a query", shown):
+    with Pulse(lambda: "scores of the field, prediction intervals" + timed * ", time of a query", shown):
+        spectra, ssim = score_spectra(np.asarray(predictions.pas), truth, dataset, index)
+        report |= spectra | {"baselines": scores}
         noisy = as_observed(trained.field, trained.params, np.asarray(predictions.pas))
         if not np.array_equal(noisy, predictions.pas):
             ssim = metrics.ssim(noisy, truth)
@@ -290,42 +297,54 @@ def evaluate(
     return report, np.asarray(predictions.pas)
 
 
+class _Beside(ThreadPoolExecutor):
+    """One more thread, for work that others do not wait for while programs compile; what has not begun at an error is
+    dropped."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+
+    def __exit__(self, *exception: Any) -> None:
+        self.shutdown(cancel_futures=True)
+
+
 def score_spectra(
     pas: Float[np.ndarray, "n 90 360"],
     truth: Float[np.ndarray, "n 90 360"],
     dataset: Dataset,
     index: Int[np.ndarray, " n"],
-    reference: Dataset,
-    shown: bool = False,
 ) -> tuple[dict[str, Any], Float[np.ndarray, " n"]]:
-    """Returns the report of spectra predicted for links, with the baselines and the repeatability of the scene beside them, and
-    the SSIM of each.
+    """Returns the report of spectra predicted for links, with the repeatability of the scene beside it, and the SSIM of each.
 
     Args:
         pas: predicted spectra.
         truth: observed spectra.
         dataset: the data.
         index: indices of the links.
-        reference: the same data, whose training links the baselines use.
-        shown: print progress on stderr.
 
     Raises:
         UserError: a prediction is NaN or infinite.
     """
     groups = dataset.frequencies_hz[index], in_sight(dataset, index)
-    elements = dataset.receiver().element_positions
-    beside = baselines(reference) if can_lend(reference, index) else {}
-    rivals = {}
-    with CountProgress("scores of the field and of simple methods", 1 + len(beside), shown=shown) as progress:
-        figures = metrics.figures(pas, truth, elements)
-        progress.advance()
-        for name, predict in beside.items():
-            rivals[name] = metrics.score(np.asarray(predict(index)), truth, *groups, elements)
-            progress.advance()
+    figures = metrics.figures(pas, truth, dataset.receiver().element_positions)
     report = metrics.summarise(figures, *groups, dataset.receiver_index[index])
     repeats = repeatability(dataset.name, np.unique(groups[0]) / 1e9)
-    report |= {} if repeats is None else {"truth_repeats": repeats}
-    return report | {"baselines": rivals}, figures["ssim"]
+    return report | ({} if repeats is None else {"truth_repeats": repeats}), figures["ssim"]
+
+
+def baseline_scores(
+    dataset: Dataset, index: Int[np.ndarray, " n"], reference: Dataset
+) -> dict[str, Callable[[], dict[str, Any]]]:
+    """Returns a function for every baseline that predicts and scores the spectra of links, from the training links of
+    `reference`; none if these have nothing in common with the links."""
+
+    def scored(predict: Callable[[Int[np.ndarray, " n"]], Any]) -> dict[str, Any]:
+        truth, elements = np.asarray(dataset.pas(index)), dataset.receiver().element_positions
+        groups = dataset.frequencies_hz[index], in_sight(dataset, index)
+        return metrics.score(np.asarray(predict(index)), truth, *groups, elements)
+
+    beside = baselines(reference) if dataset.has_spectra and can_lend(reference, index) else {}
+    return {name: partial(scored, predict) for name, predict in beside.items()}
 
 
 def expectations(
