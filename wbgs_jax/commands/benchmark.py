@@ -87,7 +87,7 @@ def write_queries(folder: Path, scenes: tuple[str, ...]) -> None:
 def score_scene(path: Path, dataset: "Dataset") -> dict[str, Any]:
     """Returns the report of a file of predictions for the test links of a scene, as `wbgs-jax eval` reports a run."""
     from wbgs_jax.data.dataset import with_validation_trained
-    from wbgs_jax.evaluation.score import baseline_scores, power_figures, score_snapshots, score_spectra
+    from wbgs_jax.evaluation.score import lending_baselines, power_figures, score_snapshots, score_spectra, true_spectra
 
     index, reference = dataset.test, with_validation_trained(dataset)
     arrays = read_predictions(path, dataset)
@@ -96,8 +96,10 @@ def score_scene(path: Path, dataset: "Dataset") -> dict[str, Any]:
         report |= score_snapshots(arrays["snapshots"], dataset.observations["snapshots"][index])
     pas = arrays["pas"] if "pas" in arrays else spectra(arrays["snapshots"], dataset, index) if "snapshots" in arrays else None
     if pas is not None:
-        report |= score_spectra(pas, np.asarray(dataset.pas(index)), dataset, index)[0]
-        report["baselines"] = {name: score() for name, score in baseline_scores(dataset, index, reference).items()}
+        truth = true_spectra(dataset, index)
+        report |= score_spectra(pas, truth, dataset, index)[0]
+        lent = lending_baselines(reference, index)
+        report["baselines"] = {name: truth.score(np.asarray(predict(index))) for name, predict in lent.items()}
     if "power_db" in arrays and (power := power_figures(arrays["power_db"], reference, index)):
         report |= {"power": power}
     return report

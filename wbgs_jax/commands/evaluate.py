@@ -15,10 +15,10 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import tyro
 from rich.console import Console
-from scipy.special import expit
 
 from wbgs_jax import plotting
 from wbgs_jax._util.cli import counted, run_command
@@ -30,7 +30,7 @@ from wbgs_jax.evaluation.report import closing_lines, provenance, result_path, t
 from wbgs_jax.evaluation.score import Part, evaluate, held_out
 from wbgs_jax.fields.base import outputs_of
 from wbgs_jax.inference.kriging import FILE as NEIGHBOURS
-from wbgs_jax.inference.kriging import Beside, Mixture
+from wbgs_jax.inference.kriging import Beside, Mixture, field_share
 from wbgs_jax.inference.predictor import BLOCK
 from wbgs_jax.inference.trained_field import TrainedField, at_receivers
 from wbgs_jax.training import curves
@@ -112,9 +112,7 @@ def correction_lines(correction: Beside) -> list[str]:
     count = counted(len(correction.images), "measured spectrum", "measured spectra")
     if not isinstance(correction, Mixture):
         return [f"predictions are corrected by the nearest of {count} ({NEIGHBOURS})"]
-    mean, deviation, nearest, farthest = np.asarray(correction.log_distance)
-    logits = correction.field[0] + correction.field[1] * (np.array([nearest, farthest]) - mean) / deviation
-    low, high = np.sort(expit(np.asarray(logits)))
+    low, high = np.sort(np.asarray(field_share(correction, jnp.exp(correction.log_distance[2:]))))  # nearest, farthest
     weight = f"{low:.2f}" if high - low < 0.005 else f"{low:.2f} to {high:.2f}"
     return [f"predictions mix the field (weight {weight}) with simple methods on {count} ({NEIGHBOURS})"]
 

@@ -94,10 +94,10 @@ def _steering(
     return np.exp(2j * np.pi * np.einsum("nek,nk->ne", own, directions))
 
 
-def _explained(snapshots: Complex[np.ndarray, "n e"], steering: Complex[np.ndarray, "n e"]) -> Float[np.ndarray, " n"]:
-    """Returns the share of the power of snapshots that one plane wave explains."""
+def _explained(snapshots: Complex[np.ndarray, "*#n e"], steering: Complex[np.ndarray, "*#n e"]) -> Float[np.ndarray, "*n"]:
+    """Returns the share of the power of snapshots that one plane wave explains; leading axes broadcast."""
     power = np.sum(np.abs(snapshots) ** 2, -1)
-    return np.abs(np.sum(steering.conj() * snapshots, -1)) ** 2 / np.maximum(steering.shape[1] * power, 1e-300)
+    return np.abs(np.sum(steering.conj() * snapshots, -1)) ** 2 / np.maximum(steering.shape[-1] * power, 1e-300)
 
 
 def _other_orders(elements: Float[np.ndarray, "r e 3"]) -> list[Float[np.ndarray, "r e 3"]]:
@@ -134,9 +134,7 @@ def _shuffled(
         return False
     elements = np.asarray(dataset.receivers.element_positions, np.float64)
     steering = _steering(dataset, links[same], directions[same], elements, dataset.receivers.unit)
-    values = snapshots[same]
-    power = np.sum(np.abs(values) ** 2, -1)[:, None] * values.shape[1]
-    fits = np.abs(values @ steering.conj().T) ** 2 / np.maximum(power, 1e-300)  # (link, direction of a transmitter)
+    fits = _explained(snapshots[same][:, None], steering[None])  # (link, direction of a transmitter)
     # Mean share that the best direction explains if there are lines of sight (of noise: about 0.25), and minimum difference of
     # that of other transmitters if they are in different directions.
     single, apart = 0.5, 0.2

@@ -12,14 +12,14 @@ Besides the accuracy of spectra, snapshots and received powers, the report has
 import dataclasses
 import time
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 from scipy.stats import rankdata
 
 from wbgs_jax import metrics
@@ -29,7 +29,7 @@ from wbgs_jax._util.progress_lines import CountProgress, Pulse
 from wbgs_jax.data.dataset import Dataset, with_validation_trained
 from wbgs_jax.data.load import RELEASED
 from wbgs_jax.data.scene import in_sight
-from wbgs_jax.evaluation.baselines import baselines, can_lend, nearest_links
+from wbgs_jax.evaluation.baselines import Baseline, baselines, can_lend, nearest_links
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.intervals import Confidence, Expected, ExpectedPower, PowerConfidence, expect_many, expected_power
@@ -256,7 +256,12 @@ def evaluate(
     with _Beside() as beside:
         calls = timed_calls(trained, dataset) if timed else {}
         compiled = [beside.submit(call) for call in calls.values()]
-        rivals = {name: beside.submit(score) for name, score in baseline_scores(dataset, index, reference).items()}
+        truth: Future[Truth] | None = None
+        rivals: dict[str, Future[dict[str, Any]]] = {}
+        if dataset.has_spectra:
+            truth = beside.submit(true_spectra, dataset, index)
+            lent = lending_baselines(reference, index)
+            rivals = {name: beside.submit(_score_baseline, predict, index, truth) for name, predict in lent.items()}
         with CountProgress("predicted spectra", len(index), shown=shown) as progress:
             predictions = observe(trained, dataset, index, progress.advance)
             for call in compiled:
@@ -274,15 +279,15 @@ def evaluate(
             calibrated = calibrate_power(trained.power_intervals, power_db, dataset, index)
             power |= {} if calibrated is None else {"confidence_db": calibrated}
         own = own_scores(predictions, dataset, index)
-    if not dataset.has_spectra:
+    if truth is None:
         return report | own | (power or {}) | time_queries(calls), np.asarray(predictions.pas)
-    truth = np.asarray(dataset.pas(index))
+    true = truth.result()
     with Pulse(lambda: "scores of the field, prediction intervals" + timed * ", time of a query", shown):
-        spectra, ssim = score_spectra(np.asarray(predictions.pas), truth, dataset, index)
+        spectra, ssim = score_spectra(np.asarray(predictions.pas), true, dataset, index)
         report |= spectra | {"baselines": scores}
         noisy = as_observed(trained.field, trained.params, np.asarray(predictions.pas))
         if not np.array_equal(noisy, predictions.pas):
-            ssim = metrics.ssim(noisy, truth)
+            ssim = metrics.ssim(noisy, true.pas)
             report["as_observed"] = {"median_ssim": float(np.median(ssim)), "mean_ssim": float(np.mean(ssim))}
         report |= own | ({"power": power} if power else {})
         intervals = trained.intervals
@@ -308,11 +313,28 @@ class _Beside(ThreadPoolExecutor):
         self.shutdown(cancel_futures=True)
 
 
+class Truth(NamedTuple):
+    """Observed spectra of N links, and what scores are grouped by."""
+
+    pas: Float[np.ndarray, "n 90 360"]
+    frequencies_hz: Float[np.ndarray, " n"]
+    sight: Bool[np.ndarray, " n"] | None
+    """Whether there is a line of sight; None without a mesh."""
+    element_positions: Float[Array, "elements 3"]
+
+    def score(self, pas: Float[np.ndarray, "n 90 360"]) -> dict[str, Any]:
+        """Returns the report of predicted spectra (`metrics.score`)."""
+        return metrics.score(pas, *self)
+
+
+def true_spectra(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Truth:
+    """Returns the observed spectra of links; computing them from snapshots, and lines of sight, takes seconds."""
+    pas, elements = np.asarray(dataset.pas(index)), dataset.receiver().element_positions
+    return Truth(pas, dataset.frequencies_hz[index], in_sight(dataset, index), elements)
+
+
 def score_spectra(
-    pas: Float[np.ndarray, "n 90 360"],
-    truth: Float[np.ndarray, "n 90 360"],
-    dataset: Dataset,
-    index: Int[np.ndarray, " n"],
+    pas: Float[np.ndarray, "n 90 360"], truth: Truth, dataset: Dataset, index: Int[np.ndarray, " n"]
 ) -> tuple[dict[str, Any], Float[np.ndarray, " n"]]:
     """Returns the report of spectra predicted for links, with the repeatability of the scene beside it, and the SSIM of each.
 
@@ -325,26 +347,19 @@ def score_spectra(
     Raises:
         UserError: a prediction is NaN or infinite.
     """
-    groups = dataset.frequencies_hz[index], in_sight(dataset, index)
-    figures = metrics.figures(pas, truth, dataset.receiver().element_positions)
-    report = metrics.summarise(figures, *groups, dataset.receiver_index[index])
-    repeats = repeatability(dataset.name, np.unique(groups[0]) / 1e9)
+    figures = metrics.figures(pas, truth.pas, truth.element_positions)
+    report = metrics.summarise(figures, truth.frequencies_hz, truth.sight, dataset.receiver_index[index])
+    repeats = repeatability(dataset.name, np.unique(truth.frequencies_hz) / 1e9)
     return report | ({} if repeats is None else {"truth_repeats": repeats}), figures["ssim"]
 
 
-def baseline_scores(
-    dataset: Dataset, index: Int[np.ndarray, " n"], reference: Dataset
-) -> dict[str, Callable[[], dict[str, Any]]]:
-    """Returns a function for every baseline that predicts and scores the spectra of links, from the training links of
-    `reference`; none if these have nothing in common with the links."""
+def lending_baselines(reference: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, Baseline]:
+    """Returns the baselines that can predict links from the training links of `reference`, by name."""
+    return baselines(reference) if can_lend(reference, index) else {}
 
-    def scored(predict: Callable[[Int[np.ndarray, " n"]], Any]) -> dict[str, Any]:
-        truth, elements = np.asarray(dataset.pas(index)), dataset.receiver().element_positions
-        groups = dataset.frequencies_hz[index], in_sight(dataset, index)
-        return metrics.score(np.asarray(predict(index)), truth, *groups, elements)
 
-    beside = baselines(reference) if dataset.has_spectra and can_lend(reference, index) else {}
-    return {name: partial(scored, predict) for name, predict in beside.items()}
+def _score_baseline(predict: Baseline, index: Int[np.ndarray, " n"], truth: Future[Truth]) -> dict[str, Any]:
+    return truth.result().score(np.asarray(predict(index)))
 
 
 def expectations(
